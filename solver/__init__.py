@@ -1,7 +1,7 @@
 """Dense non-rigid structure from motion: 2-D tracks in, a 3-D shape for every frame out.
 
-Numerics only: no environment variables, logging set-up or network, and no files but temporary ones in a given folder. Names are
-imported on first access, so that importing a record or an error does not load the solver.
+Numerics only: no environment variables, logging set-up or network, and no files except temporary ones in a given folder. Names are
+imported on first access, so importing a record or an error does not load the solver.
 """
 
 if __name__ != "pliant.solver":

@@ -1,8 +1,8 @@
 """Errors of the solver.
 
     SolverError                 base: catch this one
-    ├── InvalidInput            invalid input: states expected and got, and what to do
-    │   └── InvalidSettings     one of the settings is out of its range
+    ├── InvalidInput            invalid input, with the expected and the actual value and a hint
+    │   └── InvalidSettings     a setting is out of its range, or two settings contradict each other
     └── NotFinite               the arithmetic overflowed; no result
 
 Not converging is not an error: see `pliant.solver.Outcome`.
@@ -24,7 +24,7 @@ class SolverError(Exception):
 
 
 class NotFinite(SolverError):
-    """Overflow: the energy is infinite or NaN. Never returned as a result."""
+    """The arithmetic overflowed: the energy is infinite or NaN."""
 
     code = "not_finite"
 
@@ -41,10 +41,10 @@ class InvalidSettings(InvalidInput):
 
 
 def wrong_input(field: str, code: str, expected: str, got: str, hint: str) -> InvalidInput:
-    """Return the error of a wrong input; all parts are required, so they have an order instead of keywords."""
+    """Return the error for an invalid input; all arguments are required and therefore positional."""
     return InvalidInput(code, field=field, expected=expected, got=got, hint=hint)
 
 
 def shape_text(array: NDArray[np.generic]) -> str:
-    """Return the shape of an array as messages state it, e.g. ``(10, 3)``."""
+    """Return the shape of an array as text for messages, e.g. ``(10, 3)``."""
     return "(" + ", ".join(str(n) for n in array.shape) + ")"

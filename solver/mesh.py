@@ -67,12 +67,12 @@ class Mesh:
         Parameters
         ----------
         grid : array_like of int, shape (rows, columns)
-            The point index of each cell, −1 where there is none; every point appears exactly once.
+            Point index of each cell, −1 for holes; every point appears exactly once.
 
         Raises
         ------
         InvalidInput
-            Not two-dimensional, or the indices are not each of 0 … P−1 exactly once.
+            Not a two-dimensional integer array, or an index from 0 to P−1 is missing or repeated.
         """
         given = np.asarray(grid)
         if given.dtype.kind not in "iu" or given.ndim != 2:
@@ -101,6 +101,6 @@ class Mesh:
         following = np.roll(self.faces, -1, axis=1)
         low, high = np.minimum(self.faces, following), np.maximum(self.faces, following)
         keys = (low.astype(np.int64) * self.num_points + high).ravel()
-        keys.sort()  # of a million edges 20 times as fast as `np.unique`, which hashes them
+        keys.sort()  # for a million edges 20 times as fast as `np.unique`, which hashes them
         keys = keys[np.append(True, keys[1:] != keys[:-1])]
         return np.stack([keys // self.num_points, keys % self.num_points], axis=1).astype(self.faces.dtype)

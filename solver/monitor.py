@@ -1,4 +1,4 @@
-"""Progress and cancellation of one solve: every call of `should_stop` also counts one unit of work."""
+"""Progress and cancellation of a solve: every call of `should_stop` also counts one unit of work."""
 
 from __future__ import annotations
 
@@ -11,41 +11,40 @@ from pliant.solver.records import Step
 from pliant.solver.stages import Load, Pace, Stage
 
 MIN_FRACTION_STEP = 0.002
-"""Least increase of the fraction that is reported on its own: at most 500 calls of `on_step` besides those of the
-stages."""
+"""Minimum increase of the fraction between reports: at most 500 calls of `on_step` besides those due to stages and `MAX_SILENCE`."""
 
 MAX_SILENCE = 0.5
-"""Seconds after which a unit of work, or a pulse inside one, is reported however little the fraction has increased."""
+"""Seconds without a report after which the next unit of work or pulse is reported regardless of the fraction."""
 
 EXPECTED_SHARE = 0.9
-"""Share of a stage that its expected units fill; further units approach its end."""
+"""Completed share of a stage after its expected units; further units approach 1."""
 
 MAX_FRACTION = 0.99
 """Largest fraction reported before the end."""
 
 
 class Monitor:
-    """Reports steps with a fraction that never decreases, and remembers a request to stop.
+    """Report steps with a fraction that never decreases, and remember a request to stop.
 
-    A call counts one unit of work and returns whether to stop; pass it on as `should_stop`. Once it returned True it
-    keeps doing so. The fraction is the expected duration of the finished stages over that of the finished and the remaining ones, so
-    that the elapsed time divided by it estimates the whole. Stages that do not run are dropped from the plan.
+    A call counts one unit of work and returns whether to stop; pass the monitor on as `should_stop`. Once a call has returned True, all
+    later ones do. The fraction is the expected duration of the finished stages divided by that of all stages, so elapsed time divided by it
+    estimates the total. Stages that do not run are dropped from the plan.
 
     Parameters
     ----------
     on_step, should_stop : callable, optional
-        The user's.
+        Callbacks of the user.
     plan : sequence of Stage
-        Stages of the solve in their order.
+        Expected stages of the solve, in order.
     descent : Descent, optional
-        What is known about the reweightings before they begin.
+        Prediction of the reweightings.
     seconds_per_iteration : float
-        Planned time of an iteration of conjugate gradients.
+        Planned time of a conjugate-gradient iteration.
     clock : callable
         Monotonic seconds.
     work : callable
-        Processor seconds of this process: the pace of the work is measured in these, so that other load on the machine does not count as
-        slow work; what is left is converted by the latest seconds per processor second.
+        Processor seconds of this process. They measure the pace, so that other load on the machine does not count as slow work; the
+        remaining time is converted to wall time by the latest seconds per processor second.
     """
 
     def __init__(
@@ -60,7 +59,7 @@ class Monitor:
         work: Callable[[], float] = time.process_time,
     ) -> None:
         self.stopped = False
-        """Whether a stop was requested when somebody looked."""
+        """Whether a unit of work found a request to stop."""
         self._on_step, self._should_stop, self._clock, self._work = on_step, should_stop, clock, work
         self._last = Step("cameras", 0.0)
         self._reported = clock()
@@ -90,19 +89,19 @@ class Monitor:
             self._emit(replace(self._last, fraction=self._fraction()))
 
     def enter(self, name: str, *, units: int | None = None) -> None:
-        """Begin a stage that is ahead, otherwise nothing changes; stages before it are dropped.
+        """Begin a stage and drop the planned stages before it; do nothing if the stage is not ahead.
 
         Parameters
         ----------
         name : str
-            Of the stage.
+            Name of the stage.
         units : int, optional
-            Its units of work, where they are known better than planned.
+            Expected units of work, replacing the planned number.
         """
         place = next((number for number, stage in enumerate(self._ahead) if stage.name == name), None)
         if place is None:
             return
-        self._done += self._share * self._current.seconds  # less than planned where it ended early
+        self._done += self._share * self._current.seconds  # less than planned if it ended early
         self._pace.next(self._current, self._share, self._work())
         self._current, self._ahead = self._ahead[place], self._ahead[place + 1 :]
         if units is not None:
@@ -113,16 +112,16 @@ class Monitor:
             self._descent.begin(None, self._work())
 
     def expect(self, stages: Sequence[Stage], *, before: str) -> None:
-        """Add stages to the plan that the data turned out to require."""
+        """Insert stages that the data require into the plan, before the stage named `before`, or at the end without it."""
         place = next((number for number, stage in enumerate(self._ahead) if stage.name == before), len(self._ahead))
         self._ahead[place:place] = stages
 
     def expect_corrections(self, ahead: int) -> None:
-        """Expect at most so many corrections of the tracks for perspective; called before the first and after each."""
+        """Expect at most `ahead` corrections of the tracks for perspective; call before the first and after each."""
         self._descent.expect_corrections(ahead)
 
     def report(self, step: Step) -> None:
-        """Report a step; those after the cameras belong to the stage `shapes`, whose completed part follows from their objectives."""
+        """Report a step; the objectives of initialisation and reweightings determine the completed share of the stage `shapes`."""
         if step.stage == "finish":
             self._emit(replace(step, fraction=step.fraction if step.fraction == 1 else self._fraction()))
             return
@@ -135,7 +134,7 @@ class Monitor:
         self._emit(replace(step, fraction=self._fraction()))
 
     def report_block(self, step: Step, share: float) -> None:
-        """Report a step of one of several blocks of points; `share` of the shapes is done."""
+        """Report a step of one of several blocks of points; `share` is the completed share of the stage `shapes`."""
         self.enter("shapes")
         self._blocks, self._share = True, max(self._share, share)
         self._emit(replace(step, fraction=self._fraction()))
@@ -162,13 +161,13 @@ class Monitor:
 
 
 def enter(should_stop: Callable[[], bool] | None, name: str, *, units: int | None = None) -> None:
-    """Begin a stage of the solve that `should_stop` monitors; any other callable has no stages."""
+    """Begin a stage if `should_stop` is a `Monitor`; otherwise do nothing."""
     if isinstance(should_stop, Monitor):
         should_stop.enter(name, units=units)
 
 
 def _filled(units: int, stage: Stage) -> float:
-    """Return the completed part of a stage after so many units of work: increasing and below 1."""
+    """Return the completed share of a stage after `units` units of work: increasing and below 1."""
     share = (units + stage.setup) / max(stage.units + stage.setup, 1)
     if share > 1:
         return 1 - (1 - EXPECTED_SHARE) / share

@@ -1,8 +1,8 @@
-"""Reports from inside computations that are too long for one unit of work.
+"""Progress reports from inside long units of work.
 
-Linear algebra calls `pulse()` between pieces of work, and the monitor of the solve reports its progress again if it has been silent. The
-receiver is a context variable, like the limit of `threads`: passing it through every function of the linear algebra would add a parameter
-to all of them that none uses. Threads that `over_ranges` starts have no receiver, so reports come from the thread of the caller only.
+Linear algebra calls `pulse()` between steps, so that the monitor of the solve can report again if it has been silent. The receiver is a
+context variable, like the limit of `threads`, because passing it through the linear algebra would add a parameter to every function.
+Threads that `over_ranges` starts have no receiver; reports come only from the caller's thread.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _RECEIVER: ContextVar[Callable[[], None] | None] = ContextVar("pulse", default=N
 
 @contextmanager
 def pulses_to(receive: Callable[[], None]) -> Iterator[None]:
-    """Have `pulse` call `receive` inside the `with` block."""
+    """Let `pulse` call `receive` inside the `with` block."""
     before = _RECEIVER.set(receive)
     try:
         yield
@@ -25,7 +25,7 @@ def pulses_to(receive: Callable[[], None]) -> Iterator[None]:
 
 
 def pulse() -> None:
-    """Let the receiver, if there is one, report that the computation continues."""
+    """Notify the receiver, if there is one, that the computation continues."""
     receive = _RECEIVER.get()
     if receive is not None:
         receive()

@@ -1,8 +1,8 @@
 """`solve`: cameras, then the prior, then the shapes.
 
-Each stage is a function of its own, `estimate_cameras`, `learn_prior`, `find_outliers` and `solve_shapes` of
-`pliant.solver`. `solve` is their composition, with two additions: it puts photographs in no order into an order of their own, and it
-tests first whether the surface is isometric, where the settings give a lens.
+Each stage is also a public function of `pliant.solver`: `estimate_cameras`, `learn_prior`, `find_outliers` and `solve_shapes`. `solve`
+composes them and adds two steps: it sorts unordered photographs by content, and, where the settings describe the lens, it first tests
+whether the surface is isometric.
 """
 
 from __future__ import annotations
@@ -39,32 +39,32 @@ def solve(
     should_stop: Callable[[], bool] | None = None,
     scratch: str | Path | None = None,
 ) -> Solution:
-    """Reconstruct a shape for every frame.
+    """Reconstruct a 3-D shape for every frame.
 
     Parameters
     ----------
     tracks : Tracks
         F frames of P points.
     mesh : Mesh, optional
-        Which points are neighbours; without it there is no smoothness in space.
+        Defines which points are neighbours; without it the shapes are not smoothed in space.
     cameras : KnownCamera, optional
         Given cameras; None estimates them. Scales that are not given are estimated if the camera model has them.
     settings : Settings, optional
-        Method, weights, precision; the defaults are meant to need no change.
+        Method, weights, precision; the defaults suit most sequences.
     on_step : callable, optional
-        Called as the solve proceeds, as a rule at least every half second.
+        Called with the progress of the solve, normally at least every half second.
     should_stop : callable, optional
         Called between units of work; once it returns True, the solve ends with `Outcome.STOPPED` and the last shapes.
     scratch : path, optional
-        Folder for a temporary file that holds the result where the shapes are solved in blocks of points, beyond
-        `limits.BLOCK_OBSERVATIONS`; None holds it in memory. The file vanishes with the result.
+        Folder for a temporary file that holds the result if it exceeds `limits.BLOCK_OBSERVATIONS` and is therefore solved in blocks of
+        points; None holds it in memory. The file is deleted with the result.
 
     Raises
     ------
     InvalidInput
-        Mesh or cameras do not fit the tracks, or the tracks show nothing.
+        Mesh or cameras do not fit the tracks, or the tracks have no extent or too few points that are visible in two frames.
     InvalidSettings
-        The settings ask for what the mesh does not have.
+        The settings contradict the mesh, the cameras or the number of frames.
     NotFinite
         The arithmetic overflowed.
     OSError
@@ -96,7 +96,7 @@ def _solved(
     monitor: Monitor,
     scratch: str | Path | None,
 ) -> Solution:
-    """Solve frames in the order that they have; with `order` `any` no prior compares neighbours."""
+    """Solve the frames in their present order; with `order` `any` no prior compares neighbouring frames."""
     began = time.perf_counter()
     observations = observe(tracks, known, settings)
     verdict = isometric_verdict(tracks, known, settings, monitor)
@@ -127,7 +127,7 @@ def _started(
     monitor: Monitor,
     seconds: dict[str, float],
 ) -> Start:
-    """Return the start of the shapes, without gross outliers; its time is added to `seconds`."""
+    """Return the starting shapes with gross outliers rejected, and add the time to `seconds`."""
     monitor.enter("start")
     began = time.perf_counter()
     start = with_outliers_rejected(prepared(tracks, cameras, prior, mesh, settings, should_stop=monitor), monitor)

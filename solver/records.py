@@ -1,4 +1,4 @@
-"""Tracks and cameras, and what a solve reports of its steps and choices. Arrays are read-only."""
+"""Tracks, cameras, and the records in which a solve reports its steps and choices. Arrays are read-only."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def read_only(array: NDArray[np.generic]) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """Dense 2-D point tracks: the paper's W, kept as points."""
+    """Dense 2-D point tracks: the matrix W of Dai, Deng, He (2017), stored as points."""
 
     points: Floats
     """Image positions, shape `(F, P, 2)`, any unit, usually pixels; x right, y down unless the settings have `y_up`.
@@ -48,15 +48,15 @@ class Tracks:
         visible : array_like, shape (F, P), optional
             Bool or confidence in [0, 1].
         scratch : path, optional
-            Folder for temporary files that hold the copies; None holds them in memory. With it, and with arrays that are
-            memory-mapped themselves (`numpy.load(path, mmap_mode="r")`), tracks may be larger than the memory.
+            Folder for temporary files that hold the copies; None holds them in memory. With it and memory-mapped input
+            (`numpy.load(path, mmap_mode="r")`), tracks may be larger than the memory.
 
         Raises
         ------
         OSError
             The folder `scratch` is missing, cannot be written to, or has too little space.
         InvalidInput
-            Wrong shape or type, F < 3, P < 4, confidence outside [0, 1], or nothing visible.
+            Wrong shape or type, F < 3, P < 4, confidence outside [0, 1], or no visible observation.
         """
         given = np.asarray(points)
         if given.dtype.kind not in "fiu":
@@ -110,14 +110,14 @@ class Tracks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """The camera of every frame; `project` maps shapes to the image."""
+    """Cameras of all frames; `project` maps shapes to the image."""
 
     rotations: Floats
     """Camera from world, shape `(F, 3, 3)`; the third axis points away from the camera, or towards it if `y_up`."""
 
     scales: Floats
-    """Image units per world unit at the shape's origin, shape `(F,)`; mean of the logarithm 0 unless given or perspective; all 1 for
-    plain orthography. With a focal length φ the origin's depth is φ/s_f."""
+    """Image units per world unit at the shape's origin, shape `(F,)`; all 1 for plain orthography. The mean of the logarithm is 0 unless
+    the scales are given or the camera is perspective. With a focal length φ, the origin has depth φ/s_f."""
 
     translations: Floats
     """Image position of each frame's shape origin, shape `(F, 2)`, the tracks' unit."""
@@ -129,13 +129,13 @@ class Camera:
     """Standard deviation of an estimated φ; 0 for a given one, None for orthographic cameras and where an isometric surface gave φ."""
 
     principal_point: Floats = field(default_factory=lambda: np.zeros(2))
-    """c, shape `(2,)`, the tracks' unit; without effect for orthographic cameras."""
+    """c, shape `(2,)`, the tracks' unit; has no effect for orthographic cameras."""
 
     y_up: bool = False
-    """Whether y of the tracks grows upwards, so that depth is minus the third coordinate."""
+    """Whether y of the tracks points up, so that depth is minus the third coordinate."""
 
     def depths(self, shapes: Floats) -> Floats:
-        """Return z = ± s_f R_f[2] x, the depth beyond each frame's origin in image units, shape `(F, P)`."""
+        """Return z = ± s_f R_f[2] x, the depth behind each frame's origin in image units, shape `(F, P)`; minus if `y_up`."""
         sign = -1.0 if self.y_up else 1.0
         return np.asarray(sign * self.scales[:, None] * np.einsum("fpi,fi->fp", shapes, self.rotations[:, 2]))
 
@@ -171,14 +171,14 @@ class KnownCamera:
     """Shape `(F, 3, 3)`, camera from world."""
 
     scales: Floats | None = None
-    """Shape `(F,)`, or None: estimated when the camera model has scales. For a perspective camera φ over the depth of the shape's
+    """Shape `(F,)`; None estimates them if the camera model has scales. For a perspective camera, φ divided by the depth of the shape's
     origin."""
 
     focal: float | None = None
-    """φ, the tracks' unit; None: as in the settings."""
+    """φ, the tracks' unit; None takes it from the settings."""
 
     principal_point: tuple[float, float] | None = None
-    """(x, y), the tracks' unit; None: as in the settings."""
+    """(x, y), the tracks' unit; None takes it from the settings."""
 
     @classmethod
     def from_arrays(
@@ -189,12 +189,12 @@ class KnownCamera:
         focal: float | None = None,
         principal_point: tuple[float, float] | None = None,
     ) -> KnownCamera:
-        """Validate and copy cameras, `(F, 3, 3)`, or `(F, 2, 3)` to be completed by the cross product.
+        """Validate and copy cameras, shape `(F, 3, 3)`, or `(F, 2, 3)`, which the cross product of the rows completes.
 
         Raises
         ------
         InvalidInput
-            Wrong shape, not finite, rows not orthonormal to 1e-3, or a scale or focal length that is not positive.
+            Wrong shape, not finite, rows not orthonormal to within 1e-3, or a scale or focal length that is not positive.
         """
         if focal is not None and not (np.isfinite(focal) and focal > 0):
             raise wrong_input(
@@ -216,7 +216,7 @@ class KnownCamera:
         rows = given[:, :2]
         with np.errstate(over="ignore", invalid="ignore"):
             error = np.abs(rows @ rows.transpose(0, 2, 1) - np.eye(2)).max()
-        if not error <= 1e-3:  # NaN is no rotation either
+        if not error <= 1e-3:  # also rejects NaN
             raise wrong_input(
                 "rotations", "not_a_rotation", "orthonormal rows", f"a deviation of {error:.3g}",
                 "Rows must have length 1 and be perpendicular; scales are given separately.",
@@ -231,39 +231,39 @@ class KnownCamera:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Argument of `on_step`, called as the solve proceeds (`monitor.MIN_FRACTION_STEP`)."""
+    """Progress of a solve: the argument of `on_step`."""
 
     stage: str
     """`cameras`, `initialise`, `reweight` or `finish`."""
 
     fraction: float
-    """Estimated share of the whole solve that is done, in [0, 1]."""
+    """Completed share of the solve, estimated, in [0, 1]."""
 
     reweighting: int = 0
-    """Reweightings done."""
+    """Number of finished reweightings."""
 
     max_reweightings: int = 0
-    """Upper bound."""
+    """Maximum number of reweightings."""
 
     objective: float | None = None
-    """E after this step, normalized units; None before there is one."""
+    """E after this step, normalized units; None before the first shapes."""
 
     residual: float | None = None
-    """Median visible reprojection residual, the tracks' unit; None before there is one."""
+    """Median reprojection residual of visible observations, the tracks' unit; None before the first shapes."""
 
     seconds_left: float | None = None
-    """Estimated time until the solve ends, from the plan and the pace so far."""
+    """Estimated seconds until the solve ends, from the plan and the pace so far."""
 
 
 @dataclass(frozen=True, slots=True)
 class FocalCandidate:
-    """A focal length that was compared with others."""
+    """A focal length that the estimation of the cameras compared with others."""
 
     focal: float | None
     """Focal length, the tracks' unit; None: orthography."""
 
     mirrored: bool
-    """Whether depths had the sign that was not chosen."""
+    """Whether the depths had the opposite sign to the chosen one."""
 
     nll: float
     """Negative log likelihood of the tracks per point and frame."""
@@ -271,7 +271,7 @@ class FocalCandidate:
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """Automatic choices with their reasons, for the report."""
+    """Values chosen automatically, with reasons for the report."""
 
     basis_size: int
     temporal_weight: float
@@ -287,15 +287,15 @@ class Choices:
     camera: str = "scaled_orthographic"
     """Camera model used: `perspective`, `scaled_orthographic` or `orthographic`."""
     depth_sign: Literal["settled", "ambiguous"] = "ambiguous"
-    """Whether the sign of depth is known, from given cameras or from perspective. Orthography leaves it undetermined."""
+    """Whether given cameras or perspective determine the sign of depth; orthography does not."""
     focal_candidates: tuple[FocalCandidate, ...] = ()
     """Focal lengths that were compared; empty where perspective was not considered."""
     reasons: dict[str, str] = field(default_factory=dict)
-    """One sentence for each automatic choice, by name."""
+    """One sentence per automatic choice, by name."""
     warnings: tuple[str, ...] = ()
     """Warnings for the user, e.g. that the camera hardly moved."""
     focal_lengths: tuple[tuple[float, float], ...] = ()
-    """Focal lengths that were compared for an isometric surface, pixels, each with its isometric inconsistency I; empty if none were."""
+    """Focal lengths compared for an isometric surface, pixels, each with its isometric inconsistency I; empty if this was not tested."""
 
 
 def _positive_scales(scales: ArrayLike, frames: int) -> Floats:
@@ -320,7 +320,11 @@ def _confidence(visible: ArrayLike | None, shape: tuple[int, int], scratch: str 
         )
     if given.shape != shape:
         raise wrong_input(
-            "visibility", "wrong_shape", str(shape), shape_text(given), "Visibility is (frames, points), as the tracks."
+            "visibility",
+            "wrong_shape",
+            str(shape),
+            shape_text(given),
+            "Visibility is (frames, points), like the tracks.",
         )
     confidence[...] = given
     if not np.isfinite(confidence).all() or confidence.min() < 0 or confidence.max() > 1:

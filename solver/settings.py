@@ -1,13 +1,12 @@
 """Settings of a solve, each explained by its formula.
 
-The energy, in normalized units (the centroid of each frame's visible points is subtracted and the result divided by its
-RMS, so λ is dimensionless)::
+The energy, in normalized units (the points minus each frame's centroid, divided by their RMS radius, so λ is dimensionless)::
 
     E(S) = Σ_fp v_fp ρ(w_fp − s_f R_f S_fp)  +  λ1 ‖H S‖_F²  +  λ2 ‖A vec(S)‖²  (+ λ3 Σ_i log-det-like rank penalty)
 
-Dai, Deng, He (2017), eq. 7; the scale s_f, the weight v_fp and the rank term are ours. With the Gaussian prior λ1 Σ_p x_pᵀ Σ⁻¹ x_p
-replaces λ1 ‖H S‖², with Σ the learned covariance of a point's positions x_p; λ2 then acts in the axes in which the
-deformation is isotropic, and H and λ3 are not used.
+The energy is eq. 7 of Dai, Deng, He (2017), extended by the scale s_f, the weight v_fp and the rank term. With the Gaussian prior,
+λ1 Σ_p x_pᵀ Σ⁻¹ x_p replaces λ1 ‖H S‖², where Σ is the learned covariance of a point's positions x_p; λ2 then acts in the axes in which
+the deformation is isotropic, and H and λ3 are not used.
 """
 
 from __future__ import annotations
@@ -34,37 +33,37 @@ class Settings:
     """Settings of a solve. The defaults suit most sequences."""
 
     method: Method = "robust"
-    """`pseudo_inverse` R†W; `temporal` closed form (eq. 5); `spatio_temporal` eq. 7 with L2; `robust` eq. 7 with `loss`."""
+    """`pseudo_inverse`: R†W; `temporal`: closed form, eq. 5; `spatio_temporal`: eq. 7 with L2; `robust`: eq. 7 with `loss`."""
 
     camera: CameraModel = "auto"
     """`perspective`: a pinhole camera, u = c + (s_f R_f x + t_f) / (1 + z/φ); `scaled_orthographic`: φ = ∞, s_f per frame (gauge: mean of
     log s_f = 0); `orthographic`: also s_f = 1; `auto`: `perspective` where the tracks are clearly more probable with it, else
-    `scaled_orthographic` (always without the Gaussian prior, unless a focal length is given)."""
+    `scaled_orthographic`. Without the Gaussian prior `auto` means `scaled_orthographic`, unless a focal length is given."""
 
     focal: float | None = None
-    """φ, focal length in the tracks' unit (pixels); None estimates it. Unused with the orthographic models."""
+    """φ, focal length in the tracks' unit (pixels); None estimates it. Not allowed with the orthographic models."""
 
     field_of_view: float | None = None
     """Horizontal angle of view in degrees, instead of `focal`: φ = width / (2 tan(angle/2)). Needs `image_size`."""
 
     principal_point: tuple[float, float] | None = None
-    """c as (x, y) in the tracks' unit; None: the centre of the picture, or of the tracks where `image_size` is not given."""
+    """c as (x, y) in the tracks' unit; None: the image centre, or the centre of the tracks if `image_size` is not given."""
 
     image_size: tuple[float, float] | None = None
-    """(width, height) of the picture in pixels. The centres of its pixels lie at whole numbers, the first at (0, 0): the picture reaches
-    from −½ to width − ½, and its centre is ((width − 1)/2, (height − 1)/2)."""
+    """(width, height) of the image in pixels. Pixel centres have integer coordinates, the first (0, 0): the image extends from −½ to
+    width − ½, and its centre is ((width − 1)/2, (height − 1)/2)."""
 
     y_up: bool = False
-    """True: y of the tracks grows upwards. The third axis of the camera then points to the viewer instead of away."""
+    """Whether y of the tracks points up. The third axis of the camera then points to the viewer instead of away."""
 
     surface: Surface = "auto"
-    """`isometric`: a sheet that bends without stretching, seen in perspective; `free`: any surface; `auto`: isometric if the tracks
-    are those of a sheet and its edge lengths determine a focal length. `auto` tests this only if `image_size` or the focal length is
-    given, with camera `auto` or `perspective` and the default method and prior."""
+    """`isometric`: a sheet that bends without stretching, seen in perspective; `free`: any surface; `auto`: isometric if the tracks show
+    a sheet and its edge lengths determine a focal length. `auto` tests this only if `image_size` or the focal length is given, with
+    estimated cameras, camera `auto` or `perspective`, and the default method, preset and prior."""
 
     order: Order = "auto"
-    """`film`: neighbouring frames are alike; `any`: photographs in no order, of which no prior compares neighbours (Gaussian prior only);
-    `auto`: `film` where the tracks are more probable as a walk from frame to frame than as independent frames."""
+    """`film`: neighbouring frames are alike; `any`: unordered photographs, solved without comparing neighbours (Gaussian prior only);
+    `auto`: `film` where the tracks are more probable as a random walk from frame to frame than as independent frames."""
 
     basis_size: int | None = None
     """K of the rank-3K factorization; None selects it from the data and reports the reason."""
@@ -76,16 +75,16 @@ class Settings:
     """`paper`: λ1 = 1e-3, λ2 = 1, L1 with ε = 1e-3, first order; `auto`: weights from the noise and motion measured in the data."""
 
     temporal_weight: float | None = None
-    """λ1, dimensionless; None takes the preset's. With 0, depth is determined by the starting point only."""
+    """λ1, dimensionless; None takes the preset's value. With 0, only the starting point determines depth."""
 
     spatial_weight: float | None = None
-    """λ2, dimensionless; None takes the preset's. Unused without a mesh."""
+    """λ2, dimensionless; None takes the preset's value. Unused without a mesh."""
 
     robust_scale: float | None = None
-    """ε of the smoothed L1 (r ↦ √(r² + ε²)) or δ of Huber, in normalized units; None takes the preset's."""
+    """ε of the smoothed L1 (r ↦ √(r² + ε²)) or δ of Huber, in normalized units; None takes the preset's value."""
 
     temporal_order: Literal[1, 2] | None = None
-    """Order of the difference operator H; None takes the preset's. With the Gaussian prior it has no effect, which is reported."""
+    """Order of the difference operator H; None takes the preset's value. Has no effect with the Gaussian prior, which is reported."""
 
     loss: Loss = "l1"
     """ρ of the data term when `method` is `robust`."""
@@ -97,12 +96,12 @@ class Settings:
     prior: Prior = "gaussian"
     """Prior of method `robust` with preset `auto`. `gaussian`: a Gaussian over all frames for the positions of each point, with a
     covariance learned from the tracks (modes and a random walk, by expectation maximisation) and weight λ1; estimated cameras are
-    refined with it. `smooth`: the paper's method; `smooth+low_rank` adds a reweighted nuclear norm on the F×3P shape matrix (with
+    refined with it. `smooth`: the paper's method; `smooth+low_rank` adds a reweighted nuclear norm of the F×3P shape matrix (with
     preset `paper` only if `low_rank_weight` is given). With other methods or preset `paper`, `gaussian` means `smooth`."""
 
     low_rank_weight: float | None = None
-    """λ3, dimensionless, weight of the low-rank prior; None takes it from the data. Unless `prior` is `smooth+low_rank` it has no
-    effect, which is reported."""
+    """λ3, dimensionless, weight of the low-rank prior; None derives it from the data. Has no effect unless `prior` is
+    `smooth+low_rank`, which is reported."""
 
     max_reweightings: int = 60
     """Maximum number of reweightings, the outer IRLS iterations."""
@@ -114,7 +113,7 @@ class Settings:
     """Precision of the large arrays. The Gaussian prior always uses float64, because its equations span ten orders of magnitude."""
 
     seed: int = 0
-    """Seed of all random choices (restarts, sampled points). The same seed and thread count give bit-identical results."""
+    """Seed of all random choices (samples, held-out entries, folds). The same seed and thread count give bit-identical results."""
 
     @property
     def focal_length(self) -> float | None:
@@ -125,14 +124,14 @@ class Settings:
 
     @property
     def centre(self) -> tuple[float, float] | None:
-        """The principal point if it is given, else the picture's centre; None if neither is known."""
+        """The principal point if it is given, else the image centre; None if neither is known."""
         if self.principal_point is None and self.image_size is not None:
             return ((self.image_size[0] - 1) / 2, (self.image_size[1] - 1) / 2)
         return self.principal_point
 
     @property
     def gaussian(self) -> bool:
-        """Whether the shapes have the Gaussian prior."""
+        """Whether the solve uses the Gaussian prior."""
         return self.prior == "gaussian" and self.method == "robust" and self.preset == "auto"
 
     @property
@@ -175,7 +174,7 @@ class Settings:
 
 
 MAX_CENTRE_DISTANCE = 10.0
-"""Maximum distance of the principal point from the picture, in picture sizes: a crop may keep a tenth of a picture."""
+"""Maximum distance of the principal point from the image, in image sizes: a crop may keep a tenth of the original."""
 
 
 def check_pinhole(settings: Settings) -> None:
@@ -184,8 +183,9 @@ def check_pinhole(settings: Settings) -> None:
     Raises
     ------
     InvalidSettings
-        A focal length or size that is not positive and finite, both `focal` and `field_of_view`, an angle without `image_size` or outside
-        0 to 180 degrees, or a principal point that is not finite or too far outside the picture.
+        A focal length or size that is not positive and finite; both `focal` and `field_of_view`; an angle without `image_size` or outside
+        0 to 180 degrees; a focal length or angle with an orthographic camera; a principal point that is not finite or too far outside the
+        image.
     """
     focal, angle, centre, size = settings.focal, settings.field_of_view, settings.principal_point, settings.image_size
     if focal is not None and not (math.isfinite(focal) and focal > 0):

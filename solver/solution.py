@@ -1,4 +1,4 @@
-"""Result of a solve, and how it ended."""
+"""Result of a solve, with its outcome."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Outcome(StrEnum):
 
     @property
     def sentence(self) -> str:
-        """What happened, and what to do next where there is something to do."""
+        """Explanation of the outcome, with advice if the user can improve it."""
         return _SENTENCES[self]
 
 
@@ -42,16 +42,16 @@ _SENTENCES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:
-    """Per-reweighting history, arrays of equal length; entry 0 is the initialisation."""
+    """History of the reweightings, arrays of equal length; entry 0 is the initialisation."""
 
     objective: Floats
-    """E, normalized units; never increases, except when the tracks are corrected again for perspective."""
+    """E, normalized units; increases only when the tracks are corrected again for perspective."""
 
     residual: Floats
-    """Median visible reprojection residual, the tracks' unit."""
+    """Median reprojection residual of visible observations, the tracks' unit."""
 
     iterations: Ints
-    """Inner conjugate-gradient iterations spent."""
+    """Inner conjugate-gradient iterations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -62,13 +62,13 @@ class Solution:
     """Shape `(F, P, 3)`, world axes, the tracks' unit, centred per frame."""
 
     camera: Camera
-    """Estimated or given cameras. Depth has one free sign for the whole sequence (the bas-relief mirror)."""
+    """Estimated or given cameras. If `choices.depth_sign` is `ambiguous`, all depths may have the opposite sign."""
 
     residuals: Floats
     """Length of the reprojection residual, shape `(F, P)`, the tracks' unit; 0 where hidden."""
 
     weights: Floats
-    """Final IRLS weight relative to its largest possible value, in [0, 1], shape `(F, P)`; 0 where hidden, small for outliers."""
+    """Final IRLS weight relative to its maximum, in [0, 1], shape `(F, P)`; 0 where hidden, small for outliers."""
 
     trace: Trace
     outcome: Outcome
@@ -77,15 +77,15 @@ class Solution:
     """Wall time per stage."""
 
     shapes_std: Floats | None = None
-    """Posterior standard deviation of every position, shape `(F, P)`, the unit of the shapes; None where the prior has no posterior."""
+    """Standard deviation of every position, shape `(F, P)`, the unit of the shapes; None for priors without a posterior."""
 
     trust: Trust | None = None
-    """Expected error, verdict and its reasons."""
+    """Expected error, and a verdict with reasons."""
 
     inlier_probability: Floats | None = None
-    """Posterior probability that an observation is an inlier, shape `(F, P)`; 0 where rejected, NaN where hidden. With α the share of
-    outliers, A the area of the tracks, and p the density of the loss at the scale of the noise: (1 − α) p / ((1 − α) p + α / A); in full in
-    `pliant.solver.shapes.inliers`."""
+    """Posterior probability that an observation is an inlier, shape `(F, P)`; 0 where rejected, NaN where hidden. It is
+    (1 − α) p / ((1 − α) p + α / A) with α the share of outliers, A the area of the tracks, and p the density of the loss at the scale of
+    the noise; see `pliant.solver.shapes.inliers`."""
 
     def __repr__(self) -> str:
         frames, points, _ = self.shapes.shape

@@ -1,8 +1,8 @@
-"""The stages that a solve goes through, and about how long each takes: the basis of its progress.
+"""Stages of a solve and their expected durations, from which its progress is estimated.
 
-Stages of the cameras consist of units of work, iterations of L-BFGS and rounds of expectation maximisation, whose cost grows with the
+Stages of the cameras consist of units of work: iterations of L-BFGS and of expectation maximisation, whose cost grows with the number of
 frames that the stage uses. Only ratios of the durations matter, because the remaining time is extrapolated from the elapsed time. Which
-stages run depends on the data: one that is skipped is dropped from the plan when a later one begins.
+stages run depends on the data; a skipped stage is dropped from the plan when a later one begins.
 """
 
 from __future__ import annotations
@@ -15,27 +15,28 @@ from pliant.solver.limits import LEARNED_FRAMES
 from pliant.solver.records import Floats
 
 UNIT_SECONDS, FRAME_SECONDS = 7e-5, 1.3e-5
-"""Seconds per unit of work, and per unit and frame, on one core: .2 ms at 10 frames, .46 at 30, .7 at 48, 1 at 74. The other times
-below are of the same core."""
+"""Seconds per unit of work, and in addition per unit and frame, on one core: .2 ms at 10 frames, .46 at 30, .7 at 48, 1 at 74. The times
+below were measured on the same core."""
 
 ITERATION_FRAME_SECONDS, ITERATION_SECONDS = 3e-5, {True: 5.3e-8, False: 4e-8}
-"""Seconds per unit of a reweighting and frame, whatever the number of points, and further ones per frame and point, with and without a
-learned prior; measured for 40 × 800, 60 × 4,000, 99 × 600, 99 × 6,000, 300 × 300, 1,000 × 300 and 3,000 × 300: within 40 %."""
+"""Seconds per unit of a reweighting: per frame, and in addition per frame and point; the key is whether a prior is learned. Within 40 % of
+the times measured for 40 × 800, 60 × 4,000, 99 × 600, 99 × 6,000, 300 × 300, 1,000 × 300 and 3,000 × 300."""
 
 START_FRAME_SECONDS, START_SECONDS, START_UNITS = 5e-4, 8e-7, 9
-"""Of the start of the shapes: seconds per frame, further ones per frame and point, and its units. Measured for the same sizes and
+"""Start of the shapes: seconds per frame, in addition per frame and point, and units of work. Measured for the same sizes and
 50 × 100,000."""
 
 FINISH_SECONDS = 3e-7
-"""Seconds per frame and point of the solution in the tracks' unit and of the probabilities; measured for 50 × 30,000 and 50 × 100,000."""
+"""Seconds per frame and point to convert the solution to the tracks' unit and compute inlier probabilities; measured for 50 × 30,000 and
+50 × 100,000."""
 
 SURFACE_SECONDS, SURFACE_SETUP = 0.7, 40
-"""Seconds per frame of the search for an isometric surface, on at most 24 frames, and the units that its preparation takes as long as."""
+"""Search for an isometric surface: seconds per frame, on at most 24 frames, and duration of its preparation in units of work."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A part of a solve."""
+    """A stage of a solve."""
 
     name: str
     seconds: float
@@ -45,18 +46,18 @@ class Stage:
     """Expected units of work."""
 
     growth: float = 1.0
-    """Time of a unit over that of the one before."""
+    """Ratio of the times of consecutive units."""
 
     setup: int = 0
-    """Units that what comes before the first one takes as long as."""
+    """Duration of the preparation before the first unit, in units."""
 
 
 COMPLETION_SECONDS, MOST_COMPLETED, RANK_GROWTH = 8e-7, (60, 600), 2.0
-"""Seconds per frame, frame and point of filling hidden positions; the largest numbers of frames and points that count, because the ranks
-that are tried end at 40; and the growth of the time from one rank to the next."""
+"""Completion of hidden positions: seconds per squared frame count and point; the numbers of frames and of points above which the time no
+longer grows, because the ranks tried end at 40; and the ratio of the times of consecutive ranks."""
 
 GRAM_SECONDS = 1e-9
-"""Seconds per point and square of the number of frames of the Gram matrix of all tracks: 8 operations, 10 s for 100 × 1,000,000."""
+"""Seconds per point and squared number of frames for the Gram matrix of all tracks: 8 operations, 10 s for 100 × 1,000,000."""
 
 UNITS = {
     "multistart": (1600, 120, 1.3),
@@ -70,32 +71,32 @@ UNITS = {
     "extension": (80, 1_000_000, 3.0),
     "trust": (10, 100, 60.0),
 }
-"""Stages of the default prior: typical number of units, maximum number of frames used, and cost of a unit against that of an iteration.
-Measured on sequences of 10 to 80 frames, clean and spoiled."""
+"""Stages of the default prior: typical number of units, maximum number of frames used, and cost of a unit relative to a unit of
+`UNIT_SECONDS`. Measured on sequences of 10 to 80 frames, clean and corrupted."""
 
 CUBIC_FRAMES = {"covariance": 200}
-"""Frames for which a unit takes twice as long as the above says, because it also takes eigenvalues, whose time is cubic in the frames.
-Measured with 360 frames, against the stage `multistart`: 2.6 to 2.7 times as long."""
+"""Number of frames at which a unit takes twice as long as `UNITS` predicts, because it also computes eigenvalues, whose time is cubic in
+the number of frames. Measured with 360 frames: 2.6 to 2.7 times the time of a unit of `multistart`."""
 
 PACE_PRIOR = 0.5
-"""Seconds of the plan that count as measured at the planned pace, so that the first units do not decide the pace alone."""
+"""Planned seconds that count as measured at the planned pace, so that the first units alone do not determine the pace."""
 
 REFINEMENT_UNITS = {True: 2930, False: 185}
-"""Units of the stage `refinement` where the covariance may couple the modes, and where the model order rules that out. The plan has a
-number between, until this is known."""
+"""Units of the stage `refinement`; the key is whether the covariance may couple the modes. Until the model order determines this, the plan
+has a number in between."""
 
 LOAD_SECONDS, LOAD_PRIOR = 20.0, 1.0
-"""Seconds over which the load of the machine is measured, and processor seconds that count as measured without any load."""
+"""Seconds over which the load of the machine is measured, and processor seconds that count as measured without load."""
 
 OWN_PACE = 4.0
-"""Weight of a stage's own pace, per completed share of it, beside that of all stages: its units take about the same time."""
+"""Weight of a stage's own pace, per completed share of it, relative to the pace of all stages: its units take similar times."""
 
 GIVEN_ROTATIONS = (1.56, 1.6)
-"""Units of the stage `scales` where rotations are given, which has a third start, against those where they are estimated, and time of a
-unit against one there: 1,283 units; measured for 30, 60 and 99 frames."""
+"""Stage `scales` with given rotations, which has a third start, relative to estimated ones: number of units (1,283), and time of a unit.
+Measured for 30, 60 and 99 frames."""
 
 UNITS_PER_START = 195
-"""Units that one of eleven starting points of the stage `starts` takes, with the second refinement of the best."""
+"""Units per starting point of the stage `starts`, averaged over eleven, including the second refinement of the best."""
 
 
 def planned(
@@ -108,7 +109,7 @@ def planned(
     known_scales: bool = False,
     unseen: float = 0.0,
 ) -> tuple[Stage, ...]:
-    """Return the stages that a solve is expected to have, in their order.
+    """Return the expected stages of a solve, in order.
 
     Parameters
     ----------
@@ -119,11 +120,11 @@ def planned(
     known_cameras : bool
         Whether rotations are given.
     known_scales : bool
-        Whether scales are given with them.
+        Whether scales are given with the rotations.
     sheet : bool
-        Whether an isometric surface is looked for.
+        Whether the tracks are tested for an isometric surface.
     unseen : float
-        Of the tracks, see `unseen_frames`.
+        `unseen_frames` of the tracks.
     """
     iterations = expected_iterations(unseen)
     work = expected_reweightings(unseen) * (1 + iterations + OVERHEAD)
@@ -140,7 +141,7 @@ def planned(
 
 
 def iteration_seconds(frames: int, points: int, *, gaussian: bool) -> float:
-    """Return the seconds of a unit of a reweighting: an iteration of conjugate gradients, or what else takes about as long."""
+    """Return the expected seconds of a unit of a reweighting: a conjugate-gradient iteration, or work of the same duration."""
     return frames * (ITERATION_FRAME_SECONDS + ITERATION_SECONDS[gaussian] * points)
 
 
@@ -155,7 +156,7 @@ def unseen_frames(visible: Floats) -> float:
 
 
 def learning(frames: int, *, gaussian: bool, known_cameras: bool, known_scales: bool = False) -> tuple[Stage, ...]:
-    """Return the stages of cameras and prior; where entries are hidden or outliers, others are added (`Monitor.expect`)."""
+    """Return the stages of cameras and prior; hidden entries and outliers add others later (`Monitor.expect`)."""
     names = ["multistart", "model_order", "starts", "perspective", "scales", "refinement", "covariance"]
     if known_cameras:
         names = ["model_order", *([] if known_scales else ["scales"]), "covariance"] if gaussian else []
@@ -173,7 +174,7 @@ def _longer(scales: Stage) -> Stage:
 
 
 def stage_of(name: str, frames: int) -> Stage:
-    """Return a stage of `UNITS` for so many frames."""
+    """Return the stage `name` of `UNITS` for a number of frames."""
     units, most_frames, cost = UNITS[name]
     used = min(frames, most_frames)
     curved = 1 + used / CUBIC_FRAMES[name] if name in CUBIC_FRAMES else 1.0
@@ -184,9 +185,9 @@ def stage_of(name: str, frames: int) -> Stage:
 class Pace:
     """Remaining time of a plan, from the durations of the stages so far.
 
-    The pace is the measured time of the finished stages over the planned time of the work that they did: it covers machines of other speed
-    and with other load. A stage that ended after fewer units than planned counts by these, or it would pass for a fast machine.
-    The shapes stay out of it, because `Descent` extrapolates them by themselves.
+    The pace is the measured time of the finished stages divided by the planned time of the work they did, which adapts the plan to speed
+    and load of the machine. A stage that ended early counts with its finished units only, or it would make the machine look faster. The
+    stage `shapes` is excluded, because `Descent` extrapolates it separately.
     """
 
     began: float
@@ -196,7 +197,7 @@ class Pace:
     planned: float = PACE_PRIOR
 
     def next(self, stage: Stage, share: float, now: float) -> None:
-        """Count a finished stage; `share` of its units was done, 0 if it was skipped."""
+        """Record a finished stage; `share` is the completed share of its units, 0 if it was skipped."""
         if share > 0 and stage.name != "shapes":
             self.measured += now - self.began
             self.planned += share * stage.seconds
@@ -204,7 +205,7 @@ class Pace:
 
     @property
     def known(self) -> float:
-        """Measured over planned time of the finished stages."""
+        """Ratio of measured to planned time of the finished stages."""
         return self.measured / self.planned
 
     def left(self, stage: Stage, share: float, ahead: float, now: float) -> float:
@@ -213,13 +214,13 @@ class Pace:
         Parameters
         ----------
         stage : Stage
-            The current one, not the shapes.
+            The current stage; not `shapes`, unless it is solved in blocks.
         share : float
-            Completed part of it.
+            Completed share of it.
         ahead : float
             Planned seconds of the stages that follow.
         now : float
-            Clock.
+            Processor time, seconds.
         """
         spent = now - self.began
         if share <= 0:
@@ -231,16 +232,16 @@ class Pace:
 
 
 class Load:
-    """Seconds that pass in one processor second of this process, measured over the last `LOAD_SECONDS`.
+    """Wall time per processor second of this process, measured over the last `LOAD_SECONDS`.
 
-    More than 1 where others use the cores, less than 1 where the process uses several.
+    Above 1 if other processes use the cores, below 1 if this process uses several cores.
     """
 
     def __init__(self, now: float, work: float) -> None:
         self._old = self._middle = (now, work)
 
     def seconds_per_work(self, now: float, work: float) -> float:
-        """Return the latest ratio, given the clock and the processor time."""
+        """Return the latest ratio, given wall time `now` and processor time `work`, both in seconds."""
         if now - self._middle[0] > LOAD_SECONDS / 2:
             self._old, self._middle = self._middle, (now, work)
         return (now - self._old[0] + LOAD_PRIOR) / (work - self._old[1] + LOAD_PRIOR)

@@ -1,4 +1,4 @@
-"""Arrays in memory, or in a temporary file that the system reads and writes as memory is short."""
+"""Arrays in memory, or memory-mapped to a temporary file."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Floats = NDArray[np.float64]
 
 
 def allocated(shape: tuple[int, ...], scratch: str | Path | None) -> Floats:
-    """Return zeros in memory, or mapped to a temporary file in the folder `scratch`.
+    """Return an array of zeros in memory, or mapped to a temporary file in the folder `scratch`.
 
-    The file has no name, where the system allows it, and vanishes with the array. Its space is reserved at once, so that a full disk is
-    an error here and not a crash at the first write beyond it.
+    The file is anonymous where the system allows it, and is deleted with the array. Its space is reserved at once, so a full disk raises an
+    error here instead of crashing the process at a later write.
 
     Raises
     ------
@@ -34,7 +34,7 @@ def allocated(shape: tuple[int, ...], scratch: str | Path | None) -> Floats:
 
 
 def let_go(*arrays: Floats | None) -> None:
-    """Take mapped arrays out of this process's memory; they are read from their file when they are used again."""
+    """Release the memory of mapped arrays; their file is read when they are used again."""
     for array in arrays:
         mapped = None if array is None else getattr(array.base, "_mmap", None)
         if isinstance(mapped, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):

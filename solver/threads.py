@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from pliant.solver.pulse import pulse
 
 SMALLEST = 200_000
-"""Minimum number of array elements per thread; below it, starting the thread costs more than it saves."""
+"""Minimum number of array elements per thread; with fewer, starting the thread costs more than it saves."""
 
 _LIMIT: ContextVar[int | None] = ContextVar("threads", default=None)
 
@@ -39,17 +39,16 @@ def threads_limited(count: int | None) -> Iterator[None]:
 
 
 def available_cores() -> int:
-    """Return the number of threads for a solve: the cores available to the process, or the limit of `threads_limited`."""
+    """Return the number of threads for a solve: the cores available to the process, at most the limit of `threads_limited`."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limit = _LIMIT.get()
     return max(1, cores if limit is None else min(cores, limit))
 
 
 def over_ranges(work: Callable[[int, int], None], count: int, *, smallest: int = 1) -> None:
-    """Call `work(start, stop)` on contiguous ranges that cover 0 … count, one range per core.
+    """Call `work(start, stop)` on contiguous ranges that cover [0, count), one per core, with at least `smallest` indices each.
 
-    Results do not depend on the number of cores as long as `work` treats indices independently and writes only to its
-    own range.
+    Results do not depend on the number of cores if `work` treats indices independently and writes only to its own range.
     """
     pulse()
     cores = min(available_cores(), max(count // smallest, 1))

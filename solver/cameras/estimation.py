@@ -33,22 +33,22 @@ PROGRESS_SHARE = 0.03
 (`solver.monitor`)."""
 
 MIN_CAMERA_TURN = np.radians(10.0)
-"""Rotation between the first and any other frame, rad, below which the user is warned."""
+"""Largest rotation relative to the first frame, rad, below which the result carries a warning."""
 
 MAX_HYPOTHESIS_GAP = 0.05
-"""Energy above the lowest after the first round up to which a factorization's own cameras stay a hypothesis for the
-refinement with shapes. True cameras are up to .05 above, false ones .10 and more. In that refinement another candidate must
-be better by as much: the walk and 99 face scans, whose errors rise by 21 and 13 % with the best one, gain less than .02, a
-small face, whose error falls to .4, gains .10."""
+"""Maximum energy above the lowest after the first round at which the unrefined cameras of a factorization remain a hypothesis
+for the refinement with shapes: true cameras lie up to .05 above, false ones .10 and more. In that refinement another candidate
+must be better by this margin: on the walk and the 99 face scans the best one gains less than .02 and raises the error by 21 and
+13 %; on a small face it gains .10 and the error falls to .4."""
 
 MAX_START_DEPTH_VARIANCE = 4.0
-"""Mean squared depth of the closed form, normalized units, above which cameras are no start because they hardly
-rotate: 1.8 for a horse seen from its short side, 144 for false cameras of faces."""
+"""Mean squared depth of the closed form, normalized units squared, above which cameras are rejected as a hypothesis because they
+hardly rotate: 1.8 for a horse seen from its short side, 144 for false cameras of faces."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OtherCameras:
-    """Rotations that may be more probable than those of the estimate once the shapes are known."""
+    """Alternative rotations, which may be more probable than the estimate once the shapes are known."""
 
     basis_size: int
     """K of the factorization."""
@@ -57,7 +57,7 @@ class OtherCameras:
     """Shape `(F, 3, 3)`."""
 
     description: str
-    """What distinguishes them, in a few words."""
+    """Noun phrase for the report that names what distinguishes them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,10 +65,10 @@ class CameraEstimate:
     """The cameras and how they were found."""
 
     rotations: Floats
-    """Camera from world, shape `(F, 3, 3)`; the first is the identity."""
+    """Camera from world, shape `(F, 3, 3)`; the first is the identity unless the cameras are given."""
 
     scales: Floats
-    """Shape `(F,)`, mean of the logarithm 0."""
+    """Shape `(F,)`, mean of the logarithm 0 unless given."""
 
     translations: Floats
     """Correction to the centroid, normalized units, shape `(F, 2)`."""
@@ -77,14 +77,13 @@ class CameraEstimate:
     """K of the factorization; 0 for given cameras."""
 
     gram: Floats
-    """W Wᵀ / P of the completed tracks, shape `(2F, 2F)`, normalized units; empty where it is not needed."""
+    """W Wᵀ / P of the completed tracks, shape `(2F, 2F)`, normalized units squared; empty if not needed."""
 
     sample: Floats
-    """Some points of the completed tracks, centred, shape `(F, S, 2)`, normalized units; empty where it is not
-    needed."""
+    """Sampled points of the completed tracks, centred, shape `(F, S, 2)`, normalized units; empty if not needed."""
 
     hypotheses: tuple[OtherCameras, ...] = ()
-    """About as probable: of factorizations, not refined, or of a sheet with other pose signs."""
+    """About equally probable alternatives: unrefined cameras of factorizations, or a planar object with other pose signs."""
 
     outliers: float = 0.0
     """Share of the visible entries that completion replaced as gross outliers."""
@@ -100,22 +99,22 @@ class CameraEstimate:
     `translations` are those of the corrected tracks."""
 
     ordered: bool = True
-    """Whether the frames are those of a film, or photographs in no order."""
+    """True for a film, False for photographs in no order."""
 
     reasons: dict[str, str] = field(default_factory=dict)
-    """One sentence for each choice."""
+    """One sentence per choice."""
 
     warnings: tuple[str, ...] = ()
     """Reasons to distrust the result."""
 
     candidates: tuple[OtherCameras, ...] = ()
-    """All candidates of the multistart, which refinement with the shapes may rank otherwise."""
+    """All candidates of the multistart; refinement with the shapes may rank them differently."""
 
     sampled: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     """Indices of the points of `sample`, shape `(S,)`."""
 
     depth_is_typical: bool = False
-    """Whether the extent of depth rests on its prior and not on the tracks (`refinement.bas_relief`)."""
+    """Whether the prior, not the tracks, determines the extent of depth (`refinement.bas_relief`)."""
 
 
 def estimate_cameras(
@@ -126,7 +125,7 @@ def estimate_cameras(
     should_stop: Callable[[], bool] | None = None,
     rank: int = 0,
 ) -> CameraEstimate:
-    """Return the cameras of the tracks, estimated without a model of the shapes.
+    """Estimate the cameras from the tracks, without a model of the shapes.
 
     Parameters
     ----------
@@ -139,7 +138,7 @@ def estimate_cameras(
     should_stop : callable, optional
         Called between units of work; once it returns True, the best cameras so far are returned.
     rank : int
-        Of the completion, as an earlier estimate from these tracks had it; 0 chooses it.
+        Number of basis columns of the completion, from an earlier estimate of these tracks; 0 selects it.
     """
     report, ordered = on_step if on_step is not None else _silent, settings.order != "any"
     completed = complete(normalized, seed=settings.seed, rank=rank, should_stop=should_stop)
@@ -191,7 +190,7 @@ def _factorized(
     report: Callable[[Step], None],
     should_stop: Callable[[], bool] | None,
 ) -> tuple[list[Upgrade], list[Candidate]]:
-    """Return the factorization with every K of `sizes`, and the candidates for the multistart that they give at the frames used."""
+    """Return the factorization for every K of `sizes`, and from each a multistart candidate at the frames used."""
     factorized: list[Upgrade] = []
     entries: list[Candidate] = []
     for each in upgrades(gram, sizes):
@@ -226,7 +225,7 @@ def _from_factorization(size: int, rotations: Floats) -> OtherCameras:
 
 
 def _hypotheses(factorized: list[Upgrade], ran: list[Candidate], gram: Floats, used: slice) -> tuple[OtherCameras, ...]:
-    """Return the cameras of factorizations that reached nearly the lowest energy in the first round and are not too deep."""
+    """Return the cameras of factorizations with nearly the lowest energy after the first round and without excessive depth."""
     lowest = min((candidate.energy for candidate in ran), default=np.inf)
     near = {each.basis_size for each in ran if not each.smooth_start and each.energy <= lowest + MAX_HYPOTHESIS_GAP}
     return tuple(
@@ -237,12 +236,12 @@ def _hypotheses(factorized: list[Upgrade], ran: list[Candidate], gram: Floats, u
 
 
 def _everywhere(before: Floats, best: Candidate, used: slice, settings: Settings) -> tuple[Floats, str]:
-    """Return the rotations of all frames, given those of the frames in the multistart, and a sentence."""
+    """Return the rotations of all frames, carried over from the frames of the multistart, and a sentence."""
     if not settings.refine_rotations:
         return before, "Rotations are those of the factorization."
     after = carried(before, best.cameras[0], used)
     if not np.isfinite(after).all():
-        return before, "A refinement was tried and refused: it left the finite numbers."
+        return before, "The refinement was rejected: it led to values that are not finite."
     after = start_at_identity(after)
     turn = float(np.degrees(angles_between(after, before).mean()))
     how = ", from a smooth-camera start" if best.smooth_start else ""
@@ -260,13 +259,13 @@ def given_cameras(
 ) -> CameraEstimate:
     """Return given cameras as an estimate; missing scales are estimated if the camera model has them.
 
-    Estimated scales are those with which one rigid shape explains the tracks best: Σ_f ‖W_f − s_f R_f S‖² is least. A
-    common factor of all scales has no effect, because S compensates it. With the Gaussian prior they are 1 here, and
-    `refinement.joint_refinement` frees them where the likelihood gains, because a rigid shape takes deformation for scale.
+    Estimated scales minimise the residual of one rigid shape, Σ_f ‖W_f − s_f R_f S‖². A common factor of all scales has no
+    effect, because S compensates for it. With the Gaussian prior, scales are 1 here, and `refinement.joint_refinement` frees
+    them if the likelihood gains: a rigid shape would mistake deformation for a change of scale.
 
-    Where scales are known, the prior does not need the tracks' Gram matrix and translations are estimated with the
-    shapes, completion is skipped, because it could take longer than the shapes; not with `perspective`, whose depths are those of
-    the completed tracks. `rank` is as for `estimate_cameras`.
+    Completion can take longer than the shapes. It is skipped if scales are known, the prior does not need the tracks' Gram
+    matrix and translations are estimated with the shapes, but not with `perspective`, which needs the depths of completed
+    tracks. `rank` is as for `estimate_cameras`.
     """
     frames = len(known.rotations)
     exact = known.scales is not None or settings.camera == "orthographic"
@@ -309,7 +308,7 @@ def _sizes(completed: Completed, settings: Settings) -> list[int]:
 def _why(ran: list[Candidate], best: Candidate, settings: Settings) -> str:
     size = best.basis_size
     if settings.basis_size is not None:
-        return f"K = {size} as set."
+        return f"K = {size}, as set."
     tried = ", ".join(
         f"{each.basis_size}{' with a smooth start' if each.smooth_start else ''}: {each.energy:.3f}" for each in ran
     )
@@ -319,7 +318,7 @@ def _why(ran: list[Candidate], best: Candidate, settings: Settings) -> str:
 def _warnings(rotations: Floats) -> tuple[str, ...]:
     if angles_between(rotations, rotations[:1]).max() >= MIN_CAMERA_TURN:
         return ()
-    return ("The camera hardly turns around the object: the tracks do not determine depth, which is a guess.",)
+    return ("The camera hardly turns around the object: the tracks do not determine depth. Treat it as a guess.",)
 
 
 def _silent(_: Step) -> None:

@@ -64,7 +64,7 @@ def upgrade(gram: Floats, basis_size: int) -> Upgrade:
 
 
 def upgrades(gram: Floats, basis_sizes: Iterable[int]) -> Iterator[Upgrade]:
-    """Yield the same for every K, from one eigendecomposition."""
+    """Yield the cameras of `upgrade` for every K, from one eigendecomposition."""
     values, vectors = np.linalg.eigh(gram)
     for basis_size in basis_sizes:
         yield _upgraded(_leading(values, vectors, 3 * basis_size), basis_size)
@@ -82,7 +82,7 @@ def _upgraded(factor: Floats, basis_size: int) -> Upgrade:
 
 
 def leading_factor(gram: Floats, rank: int) -> Floats:
-    """Return Π with Π Πᵀ ≈ gram and rank at most `rank`, shape `(F, 2, rank)`, mean row length 1."""
+    """Return Π with Π Πᵀ ≈ gram and rank at most `rank`, shape `(F, 2, rank)`, RMS row length 1."""
     return _leading(*np.linalg.eigh(gram), rank)
 
 

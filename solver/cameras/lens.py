@@ -1,4 +1,4 @@
-"""What is given about the camera's lens, checked against the tracks."""
+"""Given focal length and principal point, checked against the tracks."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from pliant.solver.settings import Settings
 from pliant.solver.tracks.normalization import Normalized
 
 MAX_CENTRE_RADII = 100.0
-"""RMS radii from the tracks' centre within which a principal point must lie where the picture's size is unknown: a view of 1° or more."""
+"""Maximum distance, along x and along y, of a principal point from the frames' centroids, RMS radii: a view of 1° or more."""
 
 
 def given_lens(
     tracks: Tracks, normalized: Normalized, settings: Settings, cameras: KnownCamera | None = None
 ) -> Perspective | None:
-    """Return what is given about perspective, or None where the camera model is orthographic.
+    """Return the given perspective parameters, or None if perspective is not considered.
 
     Without `image_size` and `principal_point` the principal point is the mean of the frames' centroids.
 
     Raises
     ------
     InvalidInput
-        Half or more of the observations lie outside the picture, the principal point is absurdly far from the tracks, or the given cameras
-        have a focal length and the settings another or an orthographic model.
+        Half or more of the observations lie outside the picture, the principal point is too far from the tracks, or the given
+        cameras have a focal length while the settings have another one or an orthographic model.
     """
     check_picture(tracks, settings)
     given = settings.focal_length

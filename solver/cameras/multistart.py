@@ -1,10 +1,10 @@
-"""Multistart over camera candidates: factorizations with several K, refined on one energy and ranked by it.
+"""Multistart over camera hypotheses: factorizations with several K, refined with one energy and ranked by it.
 
-No single K suits all data: dense surfaces with small motion need K = 1, motion capture 5 to 12, and a body that
-deforms as fast as it rotates none of them. Every K therefore gives a start, and the two most probable ones a second
-start with a smooth camera. All are refined on the manifold on the same energy (`model.marginal_likelihood` with
-`model.camera_motion_prior`), which needs no ground truth. The refinement runs in rounds; after each round the worst
-candidates are dropped, and the lowest energy is returned.
+No single K suits all data: dense surfaces with small motion need K = 1, motion capture 5 to 12, and no K suits a body
+that deforms as fast as it rotates. Every K therefore provides a start, and the two best ones a second start with a
+smooth camera. All are refined on the manifold with the same energy (`model.marginal_likelihood` with
+`model.camera_motion_prior`), which needs no ground truth. Each round of refinement drops the candidates with the highest
+energy plus a penalty on implausible depth; the best one of the last round is returned.
 
 Long sequences use every n-th frame; the correction found is interpolated to the frames in between (`carried`).
 """
@@ -73,12 +73,12 @@ class Candidate:
 
 
 def frames_used(count: int) -> slice:
-    """Return which frames the multistart uses: all of a short sequence."""
+    """Return the frames that the multistart uses: every n-th of a long sequence."""
     return slice(None, None, -(-count // MULTISTART_FRAMES))
 
 
 def gram_of(gram: Floats, used: slice) -> Floats:
-    """Return the Gram matrix of some of the frames."""
+    """Return the Gram matrix of the frames used."""
     frames = len(gram) // 2
     blocks = gram.reshape(frames, 2, frames, 2)[used][:, :, used]
     return np.ascontiguousarray(blocks).reshape(2 * len(blocks), 2 * len(blocks))
@@ -108,13 +108,13 @@ def run_multistart(
     Parameters
     ----------
     gram : shape (2F, 2F)
-        W Wᵀ / P of the completed tracks, of the frames used.
+        W Wᵀ / P of the completed tracks at the frames used.
     entries : list of Candidate
         From `with_fixed_rotations`; at least one.
     ordered : bool
-        False leaves out smooth starts and closed forms that are smooth in time.
+        False omits smooth starts and the penalty on depth, whose closed form is smooth in time.
     should_stop : callable, optional
-        Called before every refinement; once it returns True, the best so far is returned.
+        Called before every refinement and after each of its iterations; once it returns True, the best so far is returned.
     """
 
     def rating(candidate: Candidate) -> float:
@@ -142,10 +142,10 @@ def refined(candidate: Candidate, iterations: int, *, should_stop: Callable[[], 
 
 
 def smooth_start(gram: Floats, candidate: Candidate, *, should_stop: Callable[[], bool] | None = None) -> Candidate:
-    """Return a candidate with the smoothest camera motion near the given one.
+    """Return a candidate with smooth camera motion near the given one.
 
-    The factorization of a body that deforms as fast as it rotates gives jittering cameras, each near a local minimum
-    of the energy. A fit with a high noise floor and a strong camera-motion prior finds the common rotation instead.
+    The factorization of a body that deforms as fast as it rotates gives jittering cameras near a local minimum of the
+    energy. A fit with a high noise floor and a strong camera-motion prior finds the common rotation instead.
     """
     rotations, scales = candidate.cameras
     with_scales = candidate.scene.with_scales
@@ -177,7 +177,7 @@ def carried(rotations: Floats, best: Floats, used: slice) -> Floats:
     best : shape (F', 3, 3)
         Cameras of the frames used, refined.
     used : slice
-        Which frames they are.
+        The frames used.
     """
     turns = np.swapaxes(rotations[used], 1, 2) @ best
     common = nearest(turns.sum(axis=0))
@@ -210,14 +210,14 @@ def scaled_prior_weight(gram: Floats) -> float:
 
 
 def _rating(gram: Floats, candidate: Candidate) -> float:
-    """Return the energy plus a penalty where the closed form is deeper than the image is wide, a sign of rotations that are too small."""
+    """Return the energy plus a penalty if the closed form is deeper than the image is wide: its rotations are then too small."""
     return candidate.energy + max(0.0, float(np.log(max(depth(gram, candidate.cameras[0]), 1e-12) / MAX_RMS_DEPTH**2)))
 
 
 def depth(gram: Floats, rotations: Floats) -> float:
-    """Return the mean squared depth of the temporal closed form (Dai, Deng, He 2017, eq. 5), normalized units.
+    """Return the mean squared depth of the temporal closed form (Dai, Deng, He 2017, eq. 5), normalized units squared.
 
-    S = (ΠᵀΠ + λ1 HᵀH)⁻¹ Πᵀ W, so that S Sᵀ / P follows from the Gram matrix; a block-tridiagonal solve, no shapes.
+    S = (ΠᵀΠ + λ1 HᵀH)⁻¹ Πᵀ W, so S Sᵀ / P follows from the Gram matrix by a block-tridiagonal solve, without the shapes.
     """
     frames = len(rotations)
     projections = rotations[:, :2]

@@ -1,4 +1,4 @@
-"""Perspective as one scalar around a scaled-orthographic estimator: tracks corrected for depth.
+"""Perspective correction of the tracks: one scalar on top of a scaled-orthographic estimator.
 
 A pinhole camera with focal length φ sees a point of a shape whose origin lies at depth φ/s_f (camera axes x right, y down, z away) at
 
@@ -9,14 +9,14 @@ with c the principal point, t_f the image of the shape's origin relative to c, a
     (u − c) (1 + z/φ) = s_f R_f[:2] x + t_f
 
 is exactly a scaled-orthographic track of the same shape. Depths follow from the shapes, shapes from the corrected tracks; κ = 1/φ is
-the only new unknown, and κ = 0 is scaled orthography. Reversing the sign of κ is the same as mirroring all depths, x → J x, R → J R J
+the only new unknown, and κ = 0 is scaled orthography. Reversing the sign of κ is equivalent to mirroring all depths, x → J x, R → J R J
 with J = diag(1, 1, −1), which orthography cannot distinguish.
 
-Here depths are posterior means under the Gaussian of `pliant.solver.model.shape_covariance`. They are linear in the corrected tracks,
+Depths are posterior means under the Gaussian of `pliant.solver.model.shape_covariance`, which are linear in the corrected tracks:
 
-    z = D w,    D = E Σ Πᵀ (Π Σ Πᵀ + σ²I)⁻¹,    E = blockdiag(s_f R_f[2]),
+    z = D w,    D = E Σ Πᵀ (Π Σ Πᵀ + σ²I)⁻¹,    E = blockdiag(s_f R_f[2]).
 
-so that w = v ∘ (1 + κ D w), v the tracks about the principal point, is a fixed point of cheap steps in 2F dimensions.
+With v the tracks relative to the principal point, w = v ∘ (1 + κ D w) is solved by cheap fixed-point steps in 2F dimensions.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from pliant.solver.tracks.normalization import Normalized
 from scipy import linalg
 
 DEPTH_STEPS = 8
-"""Steps of the fixed point for the depths; each leaves about κ|v| ≤ .3 of the error: 1e-4 of a depth at the end."""
+"""Fixed-point steps for the depths. Each leaves about κ|v| ≤ .3 of the error: about 1e-4 of a depth after the last."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthMap:
-    """D by its factors, for films whose (F, 2F) numbers would be too many: a product is linear in the frames."""
+    """D in factored form, for films whose F × 2F matrix would be too large: a product is linear in the frames."""
 
     away: Floats
     """E, shape `(F, 3)`."""
@@ -61,18 +61,18 @@ class DepthMap:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One value of κ that was compared."""
+    """A value of κ that was compared, and its score."""
 
     curvature: float
-    """κ, inverse normalized units; negative: with all depths mirrored."""
+    """κ, inverse normalized units; if negative, depth is minus the third camera coordinate."""
 
     nll: float
-    """Negative log likelihood of the tracks per point and frame, density of the correction included."""
+    """Negative log likelihood of the tracks per point and frame, including the density of the correction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Perspective:
-    """What the tracks say about perspective."""
+    """Given and estimated perspective parameters, with the data that the correction of the tracks needs."""
 
     offsets: Floats
     """Centroid of each frame relative to the principal point, normalized units, shape `(F, 2)`."""
@@ -81,46 +81,46 @@ class Perspective:
     """Shape `(2,)`, the tracks' unit."""
 
     curvature: float = 0.0
-    """κ = 1/φ, inverse normalized units; 0: orthography. It gets the sign of `signs[0]`: that of the third axis, away or towards."""
+    """κ = 1/φ, inverse normalized units; 0: orthography. Its final sign is `signs[0]`: positive if the third axis points away."""
 
     curvature_std: float = 0.0
-    """Its standard deviation; 0 where the focal length was given."""
+    """Standard deviation of κ; 0 if κ is given or at the end of the range compared."""
 
     given: float | None = None
-    """κ of a focal length that was given."""
+    """κ of a given focal length; None if none is given."""
 
     signs: tuple[int, ...] = (1, -1)
-    """Signs of κ that are compared; only the first is possible where cameras are given."""
+    """Signs of κ to compare; given cameras admit only the first."""
 
     required: bool = False
-    """True: the camera model is `perspective`, and κ = 0 is only compared with."""
+    """Whether the camera model is `perspective`; κ = 0 then serves only for comparison."""
 
     flipped: int = 1
-    """−1 if depths were mirrored for `curvature` after the candidates were compared."""
+    """−1 if all depths, and the sign of `curvature`, were reversed after the comparison."""
 
     settled: bool = False
     """Whether the sign of depth is known."""
 
     candidates: tuple[Candidate, ...] = ()
-    """Every κ that was compared, by size."""
+    """Every κ compared, in increasing order."""
 
     filling: Filling | None = None
-    """How hidden entries are completed; None: all are seen."""
+    """How hidden entries are completed; None if there are none."""
 
     sample: Floats = field(default_factory=lambda: np.zeros((0, 0, 2)))
-    """Some complete tracks as they are, relative to the principal point, shape `(F, S, 2)`, normalized units."""
+    """Sampled complete tracks, uncorrected, relative to the principal point, shape `(F, S, 2)`, normalized units."""
 
     depth: Floats | DepthMap = field(default_factory=lambda: np.zeros((0, 0)))
-    """D of the cameras and the covariance found last, shape `(F, 2F)`."""
+    """D of the latest cameras and covariance, shape `(F, 2F)`."""
 
     @property
     def bends(self) -> bool:
-        """True if tracks are corrected."""
+        """Whether the tracks are corrected for perspective."""
         return self.curvature != 0
 
 
 def depth_map(rotations: Floats, scales: Floats, covariance: ShapeCovariance) -> Floats | DepthMap:
-    """Return D, shape `(F, 2F)`, for points whose centred image coordinates x1, y1, x2 … are one column."""
+    """Return D, shape `(F, 2F)`, which maps centred image coordinates x1, y1, x2 … of a point to its depths."""
     if len(rotations) > LEARNED_FRAMES:
         away = rotations[:, 2] * scales[:, None]
         return DepthMap(away, covariance.image_model(rotations[:, :2] * scales[:, None, None]), covariance)
@@ -173,7 +173,7 @@ def density(depths: Floats, curvature: float) -> float:
 
 
 def mirrored(rotations: Floats, covariance: ShapeCovariance) -> tuple[Floats, ShapeCovariance]:
-    """Return cameras and covariance with all depths reversed: the same under orthography."""
+    """Return cameras and covariance with all depths reversed; orthographic images do not change."""
     turned = replace(
         covariance,
         mean_covariance=MIRROR @ covariance.mean_covariance @ MIRROR,
@@ -183,14 +183,14 @@ def mirrored(rotations: Floats, covariance: ShapeCovariance) -> tuple[Floats, Sh
 
 
 def corrected_moments(view: Perspective, normalized: Normalized) -> tuple[Floats, Floats, Floats]:
-    """Return what completion returns of tracks, of the corrected ones: Gram matrix, translations and centred sample.
+    """Return Gram matrix, translations and centred sample of the corrected tracks, as completion does of uncorrected ones.
 
     Parameters
     ----------
     view : Perspective
-        With κ, the sample and D.
+        Provides κ, the sample and D.
     normalized : Normalized
-        The tracks as they are.
+        The uncorrected tracks.
 
     Returns
     -------
@@ -224,9 +224,9 @@ def posterior_depths(view: Perspective, normalized: Normalized) -> Floats:
 
 
 def orthographic(normalized: Normalized, view: Perspective | None) -> Normalized:
-    """Return the tracks corrected with posterior depths, still relative to the centroids of the tracks as they were.
+    """Return the tracks corrected with posterior depths, relative to the centroids of the uncorrected tracks.
 
-    They are the same record where there is no perspective to correct.
+    Without perspective, `normalized` itself is returned.
     """
     if view is None or not view.bends:
         return normalized
@@ -234,7 +234,7 @@ def orthographic(normalized: Normalized, view: Perspective | None) -> Normalized
 
 
 def corrected_tracks(normalized: Normalized, view: Perspective, depths: Floats) -> Normalized:
-    """Return the tracks corrected with depths `(F, P)`, relative to the centroids of the tracks as they were."""
+    """Return the tracks corrected with depths `(F, P)`, relative to the centroids of the uncorrected tracks."""
     views = normalized.points + view.offsets[:, None]
     points = corrected(views, depths, view.curvature) - view.offsets[:, None]
     return replace(normalized, points=np.where(normalized.visible[..., None] > 0, points, 0.0))

@@ -1,15 +1,15 @@
 """Cameras of a planar object (paper, cloth, a flag), whose image does not determine the sign of its tilt.
 
-A plane and its mirror image at the image plane look alike under orthography, so every frame of a thin sheet has two
+A plane and its mirror image in the image plane look alike under orthography, so every frame of a thin sheet has two
 poses, n̂ = (sin θ·u, cos θ) and (−sin θ·u, cos θ): Necker reversal. A rigid factorization selects the pose signs that
-fit a constant relief, although the relief of a sheet is due to bending and changes its sign. Further refinement does
-not leave these signs, since a high ridge separates the two poses. The correct signs are those with which few modes of
-deformation explain the tracks.
+fit a constant relief, although the relief of a sheet is due to bending and changes sign. Refinement cannot correct
+these signs, since an energy barrier separates the two poses. With the correct signs, few modes of deformation explain
+the tracks.
 
-For tracks of nearly rank two, the poses of a plane are computed in closed form up to their signs. The starts are the
-cameras known otherwise, these poses, and those with the smoothest camera, of first and of second order. From the best start,
-frames and runs of frames are reversed while the likelihood with few modes improves. Scales stay free, because the larger singular value
-of a plane's image is its scale.
+For tracks of nearly rank two, a rank-2 factorization gives the poses of a plane up to their signs. The search starts
+from the given cameras, from these poses, and from the sign choices with the smoothest camera of first and of second
+order. From the best start, frames and runs of frames are reversed while the likelihood with few modes improves. Scales
+stay free, because the larger singular value of a plane's image is its scale.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ many modes every choice of signs fits."""
 SMALLEST_SCALE = float(np.finfo(np.float64).tiny)
 
 SMALL_TILT = 1e-3
-"""Weight of mean log 1/cos θ: selects the least tilted of the planes that fit the singular values equally well."""
+"""Weight of mean log 1/cos θ: selects the least tilted of the planes that fit equally well."""
 
 FULL_ITERATIONS, TRIAL_ITERATIONS = 100, 40
 """L-BFGS iterations of a full fit, and of each trial reversal."""
@@ -74,23 +74,23 @@ class PlanarCameras:
     """Shape `(F,)`, mean of the logarithm 0."""
 
     pose_signs: PoseSigns
-    """Frames whose pose is reversed relative to the start, shape `(F,)`."""
+    """True for frames whose pose is reversed relative to the start, shape `(F,)`."""
 
     motion: Motion
     energy: float
 
 
 def is_planar(gram: Floats) -> bool:
-    """Whether tracks with this Gram matrix show a planar object, or points on one line, which lie in many planes."""
+    """Whether tracks with this Gram matrix show a planar object; points on one line count as planar."""
     values = np.linalg.eigvalsh(gram)[::-1]
     if len(values) < 6:
         return False
-    # Of a line, noise alone leaves the second value.
+    # For points on a line, the second eigenvalue is noise.
     return bool(values[2] < MAX_PLANAR_RATIO * max(values[1], MAX_PLANAR_RATIO * values[0]))
 
 
 def on_one_line(tracks: Tracks) -> bool:
-    """Whether the points lie on one line in most pictures; corrected for perspective they may not, so that `is_planar` misses it."""
+    """Whether the points of most frames lie on one line; a perspective correction can hide this from `is_planar`."""
     flat = []
     for points, visible in zip(tracks.points, tracks.visible, strict=True):
         shown = points[visible > 0]
@@ -101,24 +101,25 @@ def on_one_line(tracks: Tracks) -> bool:
 
 
 def planar_frames(count: int) -> slice:
-    """Return which frames the search uses: all of a short sequence."""
+    """Return the frames that the search uses: every n-th of a long sequence."""
     return slice(None, None, -(-count // PLANAR_FRAMES))
 
 
 def resolve_pose_signs(
     gram: Floats, rotations: Floats, *, ordered: bool = True, should_stop: Callable[[], bool] | None = None
 ) -> tuple[Floats, Floats | None, str]:
-    """Return the rotations of a planar object, given or with more probable pose signs; an alternative; and a sentence.
+    """Return the rotations of a planar object, with other pose signs if more probable; an alternative or None; and a sentence.
 
-    The alternative is the given rotations with some poses reversed, where they are the best start and few modes then explain the tracks
-    better. That may be right for a sheet and wrong for a shallow solid: the likelihood with the shapes must decide.
+    If the given rotations are the best start and reversing some of their poses improves the likelihood with few modes, the
+    reversed ones are the alternative. They may be right for a sheet and wrong for a shallow solid: the likelihood with the
+    shapes must decide.
 
     Parameters
     ----------
     gram : shape (2F, 2F)
         W Wᵀ / P of centred, complete tracks.
     rotations : shape (F, 3, 3)
-        The best that is known otherwise.
+        The best cameras so far.
     ordered : bool
         False for photographs in no order: no camera-motion prior, no smooth starts, and frames are reversed one by one.
     should_stop : callable, optional
@@ -139,7 +140,7 @@ def resolve_pose_signs(
         fits.append(fitted(part, begun[used], sizes, ordered=ordered, should_stop=should_stop))
     best = min(fits, key=lambda each: each.energy)
     found = _reverse_greedily(part, best, should_stop, ordered=ordered)
-    as_before = "The tracks are those of a sheet; its sides are as they were."
+    as_before = "The object is planar; its pose signs are unchanged."
     if found is fits[0]:
         return rotations, None, as_before
     begun, _ = starts[fits.index(best)]
@@ -147,9 +148,9 @@ def resolve_pose_signs(
     before = reversed_at(begun, _plane(found.motion)[0], pose_signs)
     after = start_at_identity(carried(before, found.rotations, used))
     if best is fits[0]:
-        return rotations, after, f"{as_before} With some of them reversed, the cameras are a further start."
+        return rotations, after, f"{as_before} Cameras with some poses reversed are an additional start."
     turn = float(np.degrees(angles_between(after, rotations).mean()))
-    why = f"other sides of it are more probable and turn it by {turn:.1f}° on average."
+    why = f"other pose signs are more probable; rotations change by {turn:.1f}° on average."
     return after, None, f"The tracks are those of a sheet; {why}"
 
 
@@ -163,7 +164,7 @@ def fitted(
     ordered: bool = True,
     should_stop: Callable[[], bool] | None = None,
 ) -> PlanarCameras:
-    """Return the cameras of highest likelihood near the given ones, whose pose signs are carried along; None for no reversal."""
+    """Return the most probable cameras near the given ones; `pose_signs` (None: no reversals) are only recorded."""
     pose_signs = np.zeros(len(rotations), dtype=bool) if pose_signs is None else pose_signs
     scene = Scene(
         gram, rotations, with_scales=True, prior_weight=PLANAR_PRIOR_WEIGHT * ordered,
@@ -178,7 +179,7 @@ def poses(gram: Floats) -> tuple[Floats, Floats]:
     """Return rotations and scales of a plane with this image; the sign of each pose is arbitrary.
 
     The rank-2 factor of W is, up to one 2×2 matrix T, s_f times the first two columns of R_f's rows, whose singular
-    values are s_f and s_f cos θ_f. T is chosen for the most even scales; among equally even ones, as for rotation
+    values are s_f and s_f cos θ_f. T is chosen for the most even scales and, if these are equally even, as in rotation
     about one axis, for the least tilt.
     """
     factor = leading_factor(gram, 2)
@@ -202,12 +203,12 @@ def poses(gram: Floats) -> tuple[Floats, Floats]:
 
 
 def _of_all_frames(pose_signs: PoseSigns, used: slice, frames: int) -> PoseSigns:
-    """Return the pose signs of the frames used for the frames after them as well, shape `(F,)`."""
+    """Return the pose signs of all frames, repeated from the frames used, shape `(F,)`."""
     return np.asarray(np.repeat(pose_signs, used.step)[:frames], dtype=bool)
 
 
 def reversed_at(rotations: Floats, plane: Floats, pose_signs: PoseSigns) -> Floats:
-    """Return the rotations with reversed pose in some frames: D R H, H the mirror at the object's plane."""
+    """Return the rotations with the pose of some frames reversed: D R H, with D the depth mirror and H that of the object's plane."""
     return np.where(pose_signs[:, None, None], MIRROR @ rotations @ plane, rotations)
 
 
@@ -216,7 +217,7 @@ def _lower(values: Floats) -> Floats:
 
 
 def _starts(rotations: Floats, *, ordered: bool) -> list[PoseSigns]:
-    """Return choices of pose signs without duplicates: as given, least rotation, least change of rotation."""
+    """Return distinct choices of pose signs: as given, least rotation, least change of rotation."""
     kept: list[PoseSigns] = []
     smooth = [smoothest_signs(rotations, 1), smoothest_signs(rotations, 2)] if ordered else []
     for pose_signs in (np.zeros(len(rotations), dtype=bool), *smooth):
@@ -251,7 +252,7 @@ def smoothest_signs(rotations: Floats, order: int) -> PoseSigns:
 def _reverse_greedily(
     gram: Floats, found: PlanarCameras, should_stop: Callable[[], bool] | None, *, ordered: bool
 ) -> PlanarCameras:
-    """Return the cameras after greedy reversals, as long as each improves the likelihood."""
+    """Return the cameras after greedy reversals, each of which improves the likelihood."""
     for _ in range(PASSES):
         plane, tried = _plane(found.motion), []
         for run in _runs(found.rotations @ plane[1]) if ordered else np.eye(len(found.rotations), dtype=bool):
@@ -285,7 +286,7 @@ def _reverse_greedily(
 
 
 def _plane(motion: Motion) -> tuple[Floats, Floats]:
-    """Return the mirror at the plane of the mean shape (3×3), and its normal (3,)."""
+    """Return the reflection in the plane of the mean shape (3×3), and the plane's normal (3,)."""
     root = np.zeros((3, 3))
     root[np.tril_indices(3)] = motion.mean_root
     normal = np.linalg.eigh(root @ root.T)[1][:, 0]
@@ -293,9 +294,9 @@ def _plane(motion: Motion) -> tuple[Floats, Floats]:
 
 
 def _runs(normals: Floats) -> list[PoseSigns]:
-    """Return the runs of frames to try to reverse, given the plane's normal in each camera, shape `(F, 3)`.
+    """Return the runs of frames whose reversal is tried, given the plane's normal in each camera, shape `(F, 3)`.
 
-    They lie between two neighbouring candidate frames, or reach from one to the end.
+    A run extends from one candidate frame to the next, or to the end.
     """
     frames = len(normals)
     facing = np.abs(normals[:, 2])

@@ -1,6 +1,6 @@
 """The scale of every frame, for a camera that zooms or moves in depth.
 
-A uniform change of size is also a deformation, so scales that reduce the residual are no evidence by themselves. They are
+A uniform change of size is also a deformation, so a smaller residual alone is no evidence for scales. They are
 adopted here if one rigid shape explains almost all of the tracks; `refinement.free_scales` adopts them if the likelihood of
 the tracks, which penalises each mode of deformation, is clearly higher with scales.
 """
@@ -14,8 +14,8 @@ from pliant.solver.settings import Settings
 
 SCALE_SHARE = 0.85
 """Minimum share of the residual of a rigid shape under orthography, beyond that of an affine camera, that scales must
-explain to be adopted. Measured: .98 on a rigid real scene, .76 on real bending paper (true scales vary) and .78 on
-faces (true scales are constant). The last two cannot be separated; above both, errors keep the scales constant."""
+explain to be adopted. Measured: .98 on a rigid real scene, .76 on real bending paper (true scales vary) and .78 on faces
+(true scales are constant). The last two cannot be separated; the threshold exceeds both, so in doubt scales stay constant."""
 
 RIGID_ENOUGH = 0.01
 """Maximum residual of the scaled rigid shape, relative to the variance of the tracks, for scales to be adopted."""
@@ -32,7 +32,7 @@ def rigid_evidence(gram: Floats, settings: Settings) -> tuple[Floats, str]:
     frames = len(gram) // 2
     none = np.ones(frames)
     if settings.camera == "orthographic":
-        return none, "Plain orthography as set."
+        return none, "Orthographic cameras, as set."
     rotations = upgrade(gram, 1).rotations
     scales = rigid_scales(gram, rotations)
     total = float(np.trace(gram))

@@ -3,10 +3,9 @@
 Near zero a robust loss is a parabola with curvature 1/ε, much steeper than a least-squares data term; far from zero
 its slope is 1, so a point follows an outlier wherever bending its path costs less than the residual. At the paper's
 λ1 = 1e-3, bending is nearly free and gross outliers are fitted. An outlier is resisted once λ1 ‖H S‖² of the jump
-exceeds the jump itself, which for jumps of one RMS radius requires λ1 well above 1. Exact data are still fitted
-exactly, since the loss has slope 1 from the first residual on. λ2 must stay far below λ1: where the camera does not
-determine depth, the two priors decide it, and a large λ2 flattens the surface. See `benchmarks/README.md` for
-measurements.
+exceeds the jump itself; for jumps of one RMS radius, this requires λ1 well above 1. Exact data are still fitted
+exactly, because the loss has slope 1 even for small residuals. λ2 must stay far below λ1: where the camera does not
+determine depth, the two priors do, and a large λ2 flattens the surface. See `benchmarks/README.md` for measurements.
 """
 
 from __future__ import annotations
@@ -23,26 +22,26 @@ from pliant.solver.tracks.noise import magnified, weighted_median
 from pliant.solver.tracks.normalization import Normalized
 
 PAPER = Weights(temporal=1e-3, spatial=1.0, low_rank=0.0, robust_scale=1e-3, order=1, rank_floor=1e-4)
-"""Dai, Deng, He (2017), section 5: λ1 = 1e-3, λ2 = 1, first order, no low-rank prior; in units of the tracks' RMS radius."""
+"""Values of Dai, Deng, He (2017), section 5: λ1 = 1e-3, λ2 = 1, first order, no low-rank prior; unit: the tracks' RMS radius."""
 
 STIFFEST = 30.0
-"""Largest λ1 of `auto` with a robust loss: no path bends to an outlier."""
+"""Largest λ1 of `auto` with a robust loss: no path bends towards an outlier."""
 
 SOFTEST = 1.0
 """Smallest λ1 of `auto` with a robust loss, for rough tracks with few frames."""
 
 STIFFNESS = 0.1
-"""λ1 times the roughness: below it, deformation does not look like an outlier."""
+"""λ1 times the roughness, RMS radii, small enough that deformation is not taken for an outlier."""
 
 JUMP_RATIO, MIN_JUMP, MAX_JUMP_SHARE = 12.0, 0.05, 0.02
-"""A third difference above `JUMP_RATIO` times the typical one and above `MIN_JUMP` RMS radii is a jump; above a share
-`MAX_JUMP_SHARE` of jumps the tracks contain gross outliers."""
+"""A third difference above `JUMP_RATIO` times the typical one and above `MIN_JUMP` RMS radii is a jump. If the share of
+jumps exceeds `MAX_JUMP_SHARE`, the tracks contain gross outliers."""
 
 SPATIAL_SHARE = 3e-4
-"""λ2/λ1 of `auto`: smooths over neighbours against outliers without flattening the depth."""
+"""λ2/λ1 of `auto`: enough smoothing over neighbours to resist outliers, too little to flatten the depth."""
 
 LEAST_SQUARES_SHARE = 1e-2
-"""λ2/λ1 of `auto` against outliers without a robust loss, where some flattening is acceptable."""
+"""λ2/λ1 of `auto` for tracks with gross outliers but no robust loss, where some flattening is acceptable."""
 
 LOW_RANK_SHARE = 3e-4
 """λ3/λ1 of `auto` with the low-rank prior."""
@@ -51,15 +50,15 @@ MIN_NOISE_STD = 1e-4
 """Floor of the noise standard deviation used with the Gaussian prior, normalized units."""
 
 BENDING_SHARE, BENDING_MODES = 0.3, 2.0
-"""λ2/λ1 of `auto` with the Gaussian prior, times the mean square of AX: below 1, because the covariance includes the
-bending; reduced where `BENDING_MODES` times the modes are fewer than the frames. Faces of 99 frames, known
-cameras: .0114 without the reduction, .0108 with it."""
+"""λ2/λ1 of `auto` with the Gaussian prior, times the mean square of AX. Below 1, because the covariance already includes
+the bending; reduced in proportion if `BENDING_MODES` times the number of modes is below the number of frames. Error on
+faces of 99 frames with known cameras: .0114 without the reduction, .0108 with it."""
 
 ROBUST_SCALE_RANGE = (1e-3, 1e-2)
-"""Range of the robust scale that follows the noise, normalized units."""
+"""Range of the robust scale, which follows the noise, normalized units."""
 
 MAX_ROBUST_SCALE = 0.1
-"""Largest robust scale with the Gaussian prior, normalized units; its fit runs after outlier rejection."""
+"""Largest robust scale with the Gaussian prior, normalized units; larger because outliers are rejected before its fit."""
 
 
 def choose_weights(
@@ -68,7 +67,7 @@ def choose_weights(
     laplacian: Laplacian | None,
     settings: Settings,
 ) -> tuple[Weights, float, dict[str, str]]:
-    """Return the weights, the noise they assume (standard deviation, normalized units) and one sentence for each choice."""
+    """Return the weights, the noise standard deviation they assume (normalized units), and the reasons by name."""
     if covariance is not None:
         noise = noise_std(covariance)
         chosen, reason = _from_covariance(covariance, settings)
@@ -94,7 +93,7 @@ def choose_weights(
 
 
 def without_effect(settings: Settings) -> tuple[str, ...]:
-    """Return a sentence for each setting that has no effect with the others."""
+    """Return a sentence for each setting that has no effect in combination with the others."""
     sentences = []
     if settings.low_rank_weight is not None and settings.prior != "smooth+low_rank":
         sentences.append(f"low_rank_weight has no effect with prior {settings.prior}; set prior to smooth+low_rank.")
@@ -107,21 +106,21 @@ def without_effect(settings: Settings) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Roughness:
-    """Noise and jumps of the tracks from third differences over frames."""
+    """Noise and jumps of the tracks, estimated from third differences over frames."""
 
     noise_std: float
     """Upper estimate of the noise's standard deviation, normalized units."""
 
     jumps: float
-    """Share of third differences that are far larger than the typical one, a sign of gross outliers."""
+    """Share of third differences far above the typical one, a sign of gross outliers."""
 
 
 def roughness_of(normalized: Normalized) -> Roughness:
     """Return noise and jumps of the tracks.
 
     The noise is the standard deviation of white noise with the same median absolute third difference over frames.
-    Smooth motion contributes little to it, and a median is robust to outliers. Short sequences use lower differences. A difference
-    weighs as much as the least confidence among its observations.
+    Smooth motion contributes little to it, and a median is robust to outliers. Short sequences use differences of lower order. The
+    weight of a difference is the least confidence of its observations.
     """
     order = min(3, len(normalized.points) - 1)
     differences = np.abs(np.diff(normalized.points, n=order, axis=0))
@@ -138,12 +137,12 @@ def roughness_of(normalized: Normalized) -> Roughness:
 
 
 def noise_std(covariance: ShapeCovariance) -> float:
-    """Return the standard deviation of the noise assumed with the Gaussian prior, normalized units."""
+    """Return the noise standard deviation assumed with the Gaussian prior, normalized units."""
     return max(float(covariance.noise_variance**0.5), MIN_NOISE_STD)
 
 
 def _from_covariance(covariance: ShapeCovariance, settings: Settings) -> tuple[Weights, str]:
-    """Return the weights with which the energy is proportional to a negative log posterior.
+    """Return the weights that make the energy proportional to a negative log posterior.
 
     Laplace residuals with standard deviation σ have the density exp(−√2 |r| / σ), so |r| + (σ / 2√2) xᵀQx is
     minimised; for Gaussian residuals it is r² + σ² xᵀQx.
@@ -159,7 +158,7 @@ def _from_covariance(covariance: ShapeCovariance, settings: Settings) -> tuple[W
 
 
 def bending_weight(temporal: float, laplacian: Laplacian, shapes: NDArray[np.floating], modes: int) -> float:
-    """Return λ2 for which the surface bends about as much as it does in shapes `(F, 3, P)`, of so many modes, found without it."""
+    """Return λ2 that preserves about the bending of shapes `(F, 3, P)` found without it; `modes` is the number of prior modes."""
     flat = shapes.reshape(-1, shapes.shape[2])
     bends = np.asarray(laplacian.matrix @ flat.T, dtype=np.float64)
     rows = float((np.diff(laplacian.matrix.indptr) > 0).mean())
@@ -177,9 +176,7 @@ def _from_data(rough: Roughness, settings: Settings) -> tuple[Weights, str]:
         PAPER, temporal=stiff, spatial=stiff * SPATIAL_SHARE, low_rank=stiff * LOW_RANK_SHARE, robust_scale=scale
     )
     why = (
-        "gross outliers have to be held back"
-        if spoiled
-        else f"frame-to-frame roughness is {rough.noise_std:.2g} RMS radii"
+        "gross outliers must be resisted" if spoiled else f"frame-to-frame roughness is {rough.noise_std:.2g} RMS radii"
     )
     return chosen, (
         f"λ1 = {stiff:.3g} because {why} ({rough.jumps:.1%} of the third differences are jumps); λ2 = {SPATIAL_SHARE:g} λ1 keeps "
@@ -190,9 +187,8 @@ def _from_data(rough: Roughness, settings: Settings) -> tuple[Weights, str]:
 def _least_squares(rough: Roughness, *, spoiled: bool) -> tuple[Weights, str]:
     """Return the weights without a robust loss.
 
-    At the published λ1 every frame is fitted almost exactly, so outliers enter the shape in full, and depth, which is
-    inferred from other frames, is inferred from their outliers. Strong smoothness in time and space is the only
-    protection.
+    At the published λ1 every frame is fitted almost exactly, so outliers enter the shape in full. Depth, which is inferred
+    from other frames, inherits the outliers of those frames. Only strong smoothness in time and space protects against them.
     """
     stiff = STIFFEST if spoiled else PAPER.temporal
     share = LEAST_SQUARES_SHARE if spoiled else SPATIAL_SHARE

@@ -1,12 +1,12 @@
-"""The low-rank prior: the shapes of all frames are combinations of few basis shapes.
+"""The low-rank prior: the shapes of all frames are combinations of a few basis shapes.
 
 With G = X Xᵀ / P the F×F Gram matrix of the frames (X as F×3P) and g_i its eigenvalues, the penalty is
 
     λ3 P Σ_i φ(g_i),    φ(g) = g/δ  for g ≤ δ,   1 + log(g/δ)  above,
 
-a reweighted nuclear norm. φ is concave and smooth, so tr φ(G) lies below its tangent tr φ'(G₀) G, a quadratic in X with
-the F×F matrix φ'(G₀). Below the floor δ all modes have the same weight, so this matrix is a multiple of the identity
-minus one term per mode above δ: one eigenproblem of size F, and a cost per point proportional to the kept modes.
+a reweighted nuclear norm. φ is concave and smooth, so tr φ(G) lies below its tangent tr φ'(G₀) G + constant, a quadratic
+in X with the F×F matrix φ'(G₀). Below the floor δ all modes have the same weight, so this matrix is a multiple of the
+identity minus one term per mode above δ. It costs one eigenproblem of size F, and per point one product per such mode.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def rank_penalty(shapes: Array, weight: float, floor: float) -> float:
 
 
 def rank_term(shapes: Array, weight: float, floor: float) -> RankTerm | None:
-    """Return the quadratic that equals the penalty at these shapes and majorises it elsewhere; None if `weight` is 0."""
+    """Return the quadratic that touches the penalty at these shapes and majorises it elsewhere; None if `weight` is 0."""
     if weight == 0:
         return None
     values, vectors = linalg.eigh(frame_gram(shapes))

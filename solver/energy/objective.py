@@ -13,7 +13,7 @@ from pliant.solver.threads import SMALLEST, over_ranges
 
 
 def residuals(problem: Problem, shapes: Array, translations: Floats) -> Array:
-    """Return w − s R x − t, shape `(F, 2, P)`, normalized units; meaningless where hidden."""
+    """Return w − s R x − t, shape `(F, 2, P)`, normalized units; undefined where hidden."""
     left = np.empty_like(problem.points, dtype=shapes.dtype)
 
     def work(start: int, stop: int) -> None:
@@ -45,7 +45,7 @@ def objective(problem: Problem, shapes: Array, residual: Array) -> float:
 
 
 def loss_of(problem: Problem, residual: Array, frame: int) -> float:
-    """Return Σ v ρ(r) of one frame, r of shape `(2, P)`."""
+    """Return Σ v ρ(r) of one frame for residuals r of shape `(2, P)`."""
     confidence = problem.confidence[frame : frame + 1]
     return loss_value(residual[None], confidence, loss=problem.loss, scale=problem.weights.robust_scale)
 
@@ -58,13 +58,13 @@ def weights_of(problem: Problem, residual: Array, frame: int) -> Array:
 
 
 def prior(problem: Problem, shapes: Array) -> float:
-    """Return the part of the energy that does not depend on the tracks."""
+    """Return the terms of the energy that do not depend on the tracks."""
     weights = problem.weights
     return smoothness(problem, shapes) + rank_penalty(shapes, weights.low_rank, weights.rank_floor)
 
 
 def smoothness(problem: Problem, shapes: Array) -> float:
-    """Return λ1 ‖HX‖² + λ2 ‖AX‖², the first replaced by λ1 tr XᵀQX with a Gaussian prior."""
+    """Return λ1 ‖HX‖² + λ2 ‖AX‖²; with a Gaussian prior the first term is λ1 tr XᵀQX."""
     weights = problem.weights
     total = 0.0 if problem.quadratic is None else problem.quadratic.value(shapes)
     temporal = weights.temporal if problem.quadratic is None else 0.0

@@ -1,4 +1,4 @@
-"""The energy to minimise, as a record."""
+"""Records of the energy to minimise and its weights."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Weights:
     order: int
     """Order of H."""
     rank_floor: float = 0.0
-    """δ of the low-rank prior: variance of a mode, per point, below which it counts as noise."""
+    """δ of the low-rank prior: variance per point below which a mode counts as noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,18 +38,18 @@ class Problem:
     points: Array
     """Centred tracks, shape `(F, 2, P)`."""
     confidence: Array
-    """v, shape `(F, P)`."""
+    """v, shape `(F, P)`, in [0, 1]; 0 where hidden or rejected."""
     projections: Array
     """s_f times the first two rows of R_f, shape `(F, 2, 3)`."""
     loss: str
     weights: Weights
     bands: Floats
-    """λ1 times the bands of HᵀH, shape `(order + 1, F)`; 0 with a Gaussian prior, which replaces them."""
+    """λ1 times the upper bands of HᵀH, shape `(order + 1, F)`; 0 with a Gaussian prior, which replaces HᵀH."""
     laplacian: Laplacian | None
     axes: Floats
-    """B (3×3): world shapes are B X. The identity unless the prior is Gaussian; its coordinates are independent along B."""
+    """B (3×3): shapes in world axes are B X. The identity, unless a Gaussian prior is independent along other axes."""
     quadratic: PathPrior | None = None
-    """λ1 times the inverse covariance over frames of each coordinate: the Gaussian prior."""
+    """The Gaussian prior: λ1 times the inverse covariance over frames of each coordinate."""
 
     moving: bool = True
-    """Whether translations are estimated with the shapes and every frame's shape is centred; not for a part of the points."""
+    """Whether to estimate translations with the shapes and centre every frame's shape; False for a block of the points."""

@@ -1,7 +1,7 @@
 """Losses of the data term and the weights of their majorising quadratics.
 
-Iteratively reweighted least squares is majorise–minimise: each loss is concave in r² and so lies below its tangent
-ω(r₀) r² + constant with ω(r) = ρ'(r) / 2r. Any decrease of the weighted problem therefore decreases the loss.
+Iteratively reweighted least squares is a majorise–minimise method: each loss is concave in r² and so lies below its
+tangent ω(r₀) r² + constant with ω(r) = ρ'(r) / 2r. Any decrease of the weighted problem therefore decreases the loss.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ def loss_value(residual: Array, confidence: Array, *, loss: str, scale: float) -
     Parameters
     ----------
     residual : array, shape (F, 2, P)
-        r, normalized units; both coordinates.
+        r, in normalized units.
     confidence : array, shape (F, P)
         v in [0, 1].
     loss : {"l1", "l2", "huber"}
-        `l1`, per coordinate as in the paper: √(r² + ε²) − ε. `l2`: r². `huber`, on the length of the residual: r² up to
-        δ, then 2δr − δ².
+        `l1`: √(r² + ε²) − ε per coordinate, as in the paper. `l2`: r². `huber`: r² up to δ, then 2δr − δ², with r the
+        length of the residual.
     scale : float
         ε or δ, normalized units.
     """
     if loss == "l2":
         return float(np.einsum("fcp,fcp,fp->", residual, residual, confidence, dtype=np.float64))
     if loss == "l1":
-        # Rationalised, because √(r² + ε²) − ε cancels for small residuals.
+        # Rationalised to avoid the cancellation in √(r² + ε²) − ε for small residuals.
         squared = residual * residual
         value = squared / (np.sqrt(squared + scale * scale) + scale)
         return float(np.einsum("fcp,fp->", value, confidence, dtype=np.float64))
@@ -40,7 +40,7 @@ def loss_value(residual: Array, confidence: Array, *, loss: str, scale: float) -
 
 
 def loss_weights(residual: Array, confidence: Array, *, loss: str, scale: float) -> Array:
-    """Return v ω(r), the factors of r² in the majorising problem, in the shape of the residual."""
+    """Return v ω(r), the weights of r² in the majorising quadratic, shape `(F, 2, P)`."""
     spread = np.broadcast_to(confidence[:, None, :], residual.shape)
     if loss == "l2":
         return np.array(spread)

@@ -47,22 +47,22 @@ class Aligned:
 
 
 def align(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -> Aligned:
-    """Centre both per frame and align `shapes` with `truth` by the transformations of `kind`.
+    """Centre both in every frame and align `shapes` with `truth` by the transformations of `kind`.
 
     Parameters
     ----------
     shapes, truth : array_like, shape (F, P, 3)
         Reconstruction and ground truth, any unit (the same one, unless `kind` is `frame_similarity`).
     kind : {'sequence', 'frame', 'frame_scaled', 'frame_similarity'}
-        `sequence`: one matrix of O(3) for the whole sequence, minimising `Σ_f ‖S_f Qᵀ − G_f‖²`.
-        `frame`: a rotation for every frame, and one mirror for the sequence (the better of the two).
-        `frame_scaled`: as `frame`, and one scale for the sequence, minimising `Σ_f ‖k S_f Q_fᵀ − G_f‖²`.
+        `sequence`: one matrix of O(3) for the sequence, minimising `Σ_f ‖S_f Qᵀ − G_f‖²`.
+        `frame`: a rotation per frame, and for the sequence a mirror or none, whichever fits better.
+        `frame_scaled`: as `frame`, with one scale for the sequence, minimising `Σ_f ‖k S_f Q_fᵀ − G_f‖²`.
         `frame_similarity`: rotation, mirror and scale free in every frame.
 
     Raises
     ------
     InvalidInput
-        The two differ in shape, are not `(F, P, 3)`, are not finite, or a frame of the truth has no extent.
+        The arrays differ in shape, are not `(F, P, 3)` or not finite, or a frame of the truth has no extent.
     """
     moved, fixed = _centred_pair(shapes, truth)
     if kind == "sequence":

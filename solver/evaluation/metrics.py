@@ -1,21 +1,21 @@
-"""Error metrics. Each variant has its own name, because values of different variants in the literature do not compare.
+"""Error metrics. Each variant has its own name, because values of different variants are not comparable.
 
 With S the reconstruction and G the ground truth, both centred in every frame:
 
 =========================  =============================================================================================
-`e3d_sequence`             one Q in O(3) for the whole sequence, no scale; mean over frames of ‖S_f Qᵀ − G_f‖_F / ‖G_f‖_F
+`e3d_sequence`             one Q in O(3) for the sequence, no scale; mean over frames of ‖S_f Qᵀ − G_f‖_F / ‖G_f‖_F
 `e3d_frame`                a rotation per frame and one mirror for the sequence; the same mean
-`e3d_frame_similarity`     rotation, mirror and scale free in every frame; the same mean. Kumar et al. (2018, 2019) and
-                           later dense papers print numbers that reproduce with this one
+`e3d_frame_similarity`     rotation, mirror and scale free in every frame; the same mean. It reproduces the figures of
+                           Kumar et al. (2018, 2019) and later papers on dense tracks
 `e3d_frame_scaled`         a rotation per frame, one mirror and one scale k for the sequence, k least squares:
                            mean over frames of ‖k S_f Q_fᵀ − G_f‖_F / ‖G_f‖_F with k = Σ_f ⟨S_f Q_fᵀ, G_f⟩ / Σ_f ‖S_f‖²
 `e3d_mocap`                Akhter et al. (2011), Gotardo and Martinez (2011): one Q in O(3);
                            `1/(σ F P) Σ_fp ‖Q s_fp − g_fp‖` with `σ = 1/(3F) Σ_f (σ_fx + σ_fy + σ_fz)`, the population
                            standard deviations of the true coordinates
-`reprojection_median`,     of `‖w_fp − project(s_fp)‖` over the visible entries (the RMS weighted with confidence), in the
-`reprojection_rms`         tracks' unit; `Camera.project` includes perspective
-`coverage`                 share of positions whose true place lies within the central 90 % interval of `shapes_std`: the
-                           distance after the alignment of `e3d_frame_scaled` is at most 4.3 k σ_fp. An honest σ has .90
+`reprojection_median`,     median and RMS of `‖w_fp − project(s_fp)‖` over the visible entries, in the tracks' unit; the
+`reprojection_rms`         RMS is weighted with confidence. `Camera.project` includes perspective
+`coverage`                 share of positions within the central 90 % interval of `shapes_std`: their distance from the
+                           truth after the alignment of `e3d_frame_scaled` is at most 4.3 k σ_fp. Calibrated: .90
 `rotation_degrees`         mean angle between estimated and true rotations after one alignment of the world axes
 `focal_error`              |φ − φ*| / φ* of the estimated φ and the true φ*; infinite where φ is infinite (orthography)
 =========================  =============================================================================================
@@ -37,9 +37,9 @@ from pliant.solver.records import Camera, Floats, Tracks
 from pliant.solver.solution import Solution
 
 NINETY = 4.3
-"""Half-width of the central 90 % interval of a position, in standard deviations. For a normal error whose σ is known it would be 1.645; σ
-is an estimate that is off by another factor in every solve, so that errors over σ, pooled over solves, have longer tails. Chosen on the
-sequences for calibration of `benchmarks.trust`, clean and spoiled, each with equal weight; it holds 90 % of the positions of the others."""
+"""Half-width of the central 90 % interval of a position, in standard deviations. For normal errors of known σ it would be 1.645. The
+estimated σ is off by a different factor in every solve, so the ratio of error to σ, pooled over solves, has longer tails. Chosen on the
+calibration sequences of `benchmarks.trust`, clean and corrupted, with equal weights; on the other sequences it covers 90 % of positions."""
 
 
 class Reprojection(NamedTuple):
@@ -73,7 +73,7 @@ def e3d_frame_scaled(shapes: ArrayLike, truth: ArrayLike) -> float:
 
 
 def coverage(shapes_std: ArrayLike, shapes: ArrayLike, truth: ArrayLike) -> float:
-    """Share of positions whose true place lies within `NINETY` standard deviations, see the table above.
+    """Share of positions that lie within `NINETY` standard deviations of the truth, see the table above.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def focal_error(camera: Camera, truth: float) -> float:
 
 
 def e3d_mocap(shapes: ArrayLike, truth: ArrayLike) -> float:
-    """Akhter's error: mean point distance over mean per-frame, per-axis spread, see the table above."""
+    """Error of Akhter et al. (2011): mean point distance over mean standard deviation of the truth, see the table above."""
     return _mocap(align(shapes, truth, kind="sequence"))
 
 
@@ -128,11 +128,7 @@ def point_errors(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -
 
 
 def reprojection(tracks: Tracks, solution: Solution) -> Reprojection:
-    """Residual of the visible observations.
-
-    Recomputed from shapes and camera, independently of `Solution.residuals`. Frames and points that are never visible do
-    not count; `Tracks` guarantees at least one visible observation.
-    """
+    """Reprojection residual of the visible observations, computed independently of `Solution.residuals`."""
     squared = np.zeros_like(tracks.visible)
     for some in frame_chunks(*squared.shape):
         image = solution.camera.at(some).project(solution.shapes[some])
@@ -145,7 +141,7 @@ def rotation_degrees(rotations: ArrayLike, truth: ArrayLike) -> float:
     """Mean angle between two camera paths, degrees, after alignment of their world axes.
 
     Orthographic views do not determine the sign of depth: a path `R_f` and its mirror `J R_f J`, `J = diag(1, 1, −1)`,
-    fit equally well, so the smaller of both angles is returned.
+    fit equally well, so the smaller of the two angles is returned.
 
     Parameters
     ----------
@@ -155,7 +151,7 @@ def rotation_degrees(rotations: ArrayLike, truth: ArrayLike) -> float:
     Raises
     ------
     InvalidInput
-        The two differ in shape or are not `(F, 3, 3)`.
+        The arrays differ in shape or are not `(F, 3, 3)`.
     """
     ours, true = np.asarray(rotations, dtype=np.float64), np.asarray(truth, dtype=np.float64)
     if true.ndim != 3 or true.shape[1:] != (3, 3) or ours.shape != true.shape:
@@ -173,15 +169,15 @@ def evaluate(
     true_rotations: ArrayLike | None = None,
     true_focal: float | None = None,
 ) -> dict[str, float]:
-    """Return every metric for which the inputs suffice, by its documented name.
+    """Return all metrics that the inputs allow, by name.
 
     Parameters
     ----------
     solution, tracks
         Result and input of the solve.
     truth : array_like, shape (F, P, 3), optional
-        Ground truth shapes, the tracks' unit, in one world frame. If the truth is in each frame's camera axes, only the
-        per-frame metrics are meaningful, not the two of the whole sequence.
+        Ground truth shapes, the tracks' unit, in one world frame. If they are in each frame's camera axes, the metrics with one alignment
+        for the sequence, `e3d_sequence` and `e3d_mocap`, are not meaningful.
     true_rotations : array_like, shape (F, 3, 3), optional
         Ground truth cameras.
     true_focal : float, optional

@@ -1,9 +1,9 @@
-"""How far a result can be trusted, without ground truth: an expected error and a verdict with its reasons.
+"""Assessment of a result without ground truth: an expected error, and a verdict with reasons.
 
-The expected error is the root of the mean variance of the positions over the size of the shapes. The variance is that of the posterior
-(`shapes.uncertainty`) and of a jackknife over parts of the object (`shapes.jackknife`), since cameras and prior are estimated from the
-same tracks. The verdict adds signs of failure that a wrong model does not show by itself: tracks that the shapes do not explain, a
-camera that hardly turned around the object, a sheet whose pose signs are ambiguous, positions that no frame shows.
+The expected error is the root mean variance of the positions divided by the size of the shapes. The variance is the sum of the posterior
+variance (`shapes.uncertainty`) and that of a jackknife over compact regions (`shapes.jackknife`), because cameras and prior are estimated
+from the same tracks. The verdict adds signs of failure that the variance of a wrong model does not show: tracks that the shapes do not
+explain, a camera that hardly turned around the object, a sheet whose pose signs are ambiguous, and positions that no frame shows.
 """
 
 from __future__ import annotations
@@ -17,35 +17,35 @@ from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats
 
 INTERVAL = (0.35, 3.6)
-"""Factors around the expected error: about the 10 and 90 % quantiles of true over expected error on the sequences for calibration of
-`benchmarks.trust`, of which they hold 45 in 56; they hold 55 in 71 of the others, where the expected error is more often too large."""
+"""Ends of the interval for the error, relative to the expected error: about the 10 and 90 % quantiles of true over expected error on the
+calibration sequences of `benchmarks.trust`, of which they contain 45 of 56. Of the other sequences, where the expected error is more often
+too large, they contain 55 of 71."""
 
 POOR, BAD = 0.2, 1.8
-"""Upper end of the expected error, share of the size, from which a result is to be used with care, and not to be used. With the first no
-solve of `benchmarks.trust` with an error above .15 is `good`; the second is an expected error of half the size, and white noise has 3 to
-4."""
+"""Upper end of the error interval, relative to the size, from which the verdict is `with_care` and `do_not_use`. With `POOR`, no solve of
+`benchmarks.trust` with an error above .15 is `good`. `BAD` is an expected error of half the size; white noise reaches 3 to 4."""
 
 LOOSE, LOST = 0.08, 0.25
-"""Median distance of visible observations from the projected shapes, share of the size: the same two degrees. Tracker noise of 5 % leaves
-.06. Where the prior has as many modes as frames, anything is fitted: `LOST_HELD_OUT` recognises that."""
+"""Median distance of visible observations from the projected shapes, relative to the size, for the same two verdicts. Tracker noise of 5 %
+leaves .06. A prior with as many modes as frames fits anything; `LOST_HELD_OUT` detects that."""
 
 NARROW, STILL = 20.0, 5.0
-"""Degrees of turn between the two most different views: the same two degrees. Depth error grows as the inverse of the turn."""
+"""Angle between the two most different views, degrees, for the same two verdicts. The error of depth grows as the inverse of the angle."""
 
 UNTOLD = 1.0
-"""Radians that the camera turns in a frame per share of its size that the shape changes in it, both medians over a film, below which
-rotation and deformation are hard to tell apart. With fewer frames a second both grow alike: the ratio is a property of the motion. Solves
-of `benchmarks.trust` below 1 have errors of .05 and more."""
+"""Rotation of the camera per frame, radians, divided by the deformation per frame, relative to the size (medians over a film), below which
+rotation and deformation are hard to separate. A lower frame rate increases both alike, so the ratio is a property of the motion. Solves of
+`benchmarks.trust` below 1 have errors of .05 and more."""
 
 LOOSE_HELD_OUT, LOST_HELD_OUT = 0.08, 0.25
-"""Median distance of held-out observations from their prediction, share of the size: the same two degrees. White noise, which is fitted to
-.04, has .7; tracks with noise of 2 % of the largest coordinate have .03 to .07, ten face scans with 10 % outliers and 30 % hidden .08."""
+"""Median distance of held-out observations from their prediction, relative to the size, for the same two verdicts. White noise, which is
+fitted to .04, has .7; tracks with noise of 2 % of the largest coordinate .03 to .07; ten face scans with 10 % outliers, 30 % hidden .08."""
 
 FLEXIBLE = 0.5
-"""Modes of deformation per frame from which the motion hardly determines depth: every second frame has a shape of its own."""
+"""Modes of deformation per frame above which the motion hardly determines depth: one independent shape every second frame."""
 
 HIDDEN_SHARE, UNSEEN_SHARE = 0.6, 0.9
-"""Share of positions without an observation: the same two degrees."""
+"""Share of positions without an observation, for the same two verdicts."""
 
 
 class Verdict(StrEnum):
@@ -58,40 +58,40 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """What a result says about its own accuracy."""
+    """Estimated accuracy of a result."""
 
     verdict: Verdict
     reasons: tuple[str, ...]
-    """A sentence with a figure for each sign that made the verdict worse than good; the gravest first."""
+    """Sentences with figures that explain why the verdict is not `good`, the most serious first."""
 
     expected_error: float | None
-    """Expected `e3d_frame`, share of the object's size; None where the prior has no posterior."""
+    """Expected `e3d_frame`, relative to the object's size; None for priors without a posterior."""
 
     interval: tuple[float, float] | None
-    """Holds the true error in nearly eight of ten solves; None where the model behind it is not believed."""
+    """Interval that contains the true error in nearly eight of ten solves; None without a posterior or where the model is doubtful."""
 
     turn_degrees: float
-    """Angle between the two most different viewing directions, degrees, at most 90: opposite directions count as the same."""
+    """Angle between the two most different viewing directions, degrees, at most 90, because opposite directions count as equal."""
 
     residual: float
-    """Median distance of visible observations from the projected shapes, share of the size."""
+    """Median distance of visible observations from the projected shapes, relative to the size."""
 
     hidden: float
-    """Share of positions that no observation shows."""
+    """Share of positions without an observation."""
 
     held_out_error: float | None = None
-    """Median distance of observations from their prediction by a tenth of the frames less (`shapes.held_out`), share of the size; None
+    """Median distance of observations from their prediction without a tenth of the frames (`shapes.held_out`), relative to the size; None
     without a posterior."""
 
     degrees_per_frame: float | None = None
-    """Median angle between the viewing directions of consecutive frames, degrees; None for photographs in no order."""
+    """Median angle between the viewing directions of consecutive frames, degrees; None for unordered photographs."""
 
     deformation_per_frame: float | None = None
-    """Median over consecutive frames of the root mean square motion of the points in world axes, share of the size; None likewise."""
+    """Median over consecutive frames of the points' RMS motion in world axes, relative to the size; None for unordered photographs."""
 
     @property
     def sentence(self) -> str:
-        """The expected error and what depth rests on, in words."""
+        """Summary of the expected error and of the turn that determines depth."""
         rests = f"depth rests on {self.turn_degrees:.0f}° of turn"
         if self.expected_error is None:
             return f"The error is not estimated; {rests}."
@@ -125,21 +125,21 @@ def assess(
     residuals : ndarray, shape (F, P)
         Distances of the observations from the projected shapes, the tracks' unit.
     visible : ndarray, shape (F, P)
-        Confidence of the observations that were used; 0 where hidden or rejected.
+        Confidence of the observations used; 0 where hidden or rejected.
     scales : ndarray, shape (F,)
         Image units per unit of the shapes.
     shapes_std : ndarray, shape (F, P), or None
-        Posterior standard deviations, the unit of the shapes.
+        Standard deviations of the positions, the unit of the shapes.
     held_out_error : float or None
-        Median distance of held-out observations from their prediction, share of the size.
+        Median distance of held-out observations from their prediction, relative to the size.
     ordered : bool
-        The frames are those of a film.
+        Whether the frames are in the order of a film.
     planar : bool
-        The tracks are those of a sheet, so that its pose signs are weakly determined.
+        Whether the tracks show a sheet, whose pose signs are weakly determined.
     modes : int
-        Modes of deformation of the prior.
+        Number of modes of deformation of the prior.
     depth_is_typical : bool
-        The extent of depth rests on a prior and not on the tracks.
+        Whether a prior, not the tracks, determines the extent of depth.
     """
     size = size_of(shapes)
     pulse()
@@ -152,10 +152,10 @@ def assess(
     residual = float(np.median(relative)) / size if relative.size else np.inf
     turn = turned(rotations)
     hidden = 1.0 - float(seen.mean())
-    unseen = f"{hidden:.0%} of the positions are not seen and drawn from their surroundings."
+    unseen = f"{hidden:.0%} of the positions are hidden and interpolated from their surroundings."
     found = [
         _sign(residual, LOOSE, LOST, f"The shapes miss the tracks by {_percent(residual)} of the object's size."),
-        _sign(-turn, -NARROW, -STILL, f"The camera turned by {turn:.0f}° only; depth needs {NARROW:.0f}° or more."),
+        _sign(-turn, -NARROW, -STILL, f"The camera turned by only {turn:.0f}°; depth needs {NARROW:.0f}° or more."),
         _sign(hidden, HIDDEN_SHARE, UNSEEN_SHARE, unseen),
     ]
     if expected is not None:
@@ -180,7 +180,7 @@ def assess(
 
 
 def _untold(turning: float, deforming: float) -> list[tuple[Verdict, str]]:
-    """Return the reason where the shape changes by more in a frame than the camera turns."""
+    """Return the reason, if the shape changes more per frame than the camera turns (`UNTOLD`)."""
     if np.radians(turning) >= UNTOLD * deforming:
         return []
     sentence = (
@@ -193,7 +193,8 @@ def _untold(turning: float, deforming: float) -> list[tuple[Verdict, str]]:
 def _doubts(modes: int, frames: int, *, off: float | None, turn: float | None) -> list[tuple[Verdict, str]]:
     """Return the reasons to doubt the model itself, which the standard deviations do not include.
 
-    `off` is how far a sheet is from its plane, `turn` that of an object whose depth is typical; None where they are not.
+    `off` is the distance of a sheet from its plane, relative to its size; `turn` is the angle of turn, degrees, of an object whose depth a
+    prior determines. Each is None where it does not apply.
     """
     found: list[tuple[Verdict, str]] = []
     if modes > FLEXIBLE * frames:
@@ -206,7 +207,7 @@ def _doubts(modes: int, frames: int, *, off: float | None, turn: float | None) -
         found.append((Verdict.WITH_CARE, sentence))
     if turn is not None:
         sentence = (
-            f"With {turn:.0f}° of turn the tracks hardly show how deep the object is; its depth is one that is usual for its width. Let it "
+            f"With {turn:.0f}° of turn the tracks hardly determine the object's depth; a depth typical for its width is assumed. Let it "
             "turn further."
         )
         found.append((Verdict.WITH_CARE, sentence))
@@ -216,14 +217,14 @@ def _doubts(modes: int, frames: int, *, off: float | None, turn: float | None) -
 def size_of(shapes: Floats) -> float:
     """Return the root mean square distance of the points from their frame's mean point; positive."""
     squares = []
-    for frame in shapes:  # one at a time, for its memory
+    for frame in shapes:  # one at a time, to limit memory
         pulse()
         squares.append(float(np.square(frame - frame.mean(axis=0)).sum()))
     return max(float(np.sqrt(np.sum(squares) / max(shapes.shape[0] * shapes.shape[1], 1))), np.finfo(float).tiny)
 
 
 def off_plane(shapes: Floats) -> float:
-    """Return the root mean square distance of the points from the plane that fits their frame best, share of the size, median of frames."""
+    """Return the RMS distance of the points from their frame's best-fitting plane, relative to the size, as a median over frames."""
     some = shapes[:: max(1, len(shapes) // 100)]
     spreads = [np.linalg.eigvalsh(np.cov(frame.T, bias=True)) for frame in some]
     return float(
@@ -232,7 +233,7 @@ def off_plane(shapes: Floats) -> float:
 
 
 def per_frame(shapes: Floats, rotations: Floats) -> tuple[float | None, float | None]:
-    """Return degrees of turn and share of the size that the shape changes, medians over consecutive frames; None for one frame."""
+    """Return turn, degrees, and change of shape, relative to the size, as medians over consecutive frames; None for one frame."""
     if len(shapes) < 2:
         return None, None
     directions, steps = rotations[:, 2], []
@@ -246,7 +247,7 @@ def per_frame(shapes: Floats, rotations: Floats) -> tuple[float | None, float | 
 
 
 def turned(rotations: Floats) -> float:
-    """Return the largest angle between two viewing directions, degrees; opposite views of an orthographic camera count as one."""
+    """Return the largest angle between two viewing directions, degrees; opposite directions count as equal."""
     directions = rotations[:: max(1, len(rotations) // 500), 2]
     cosines = np.abs(directions @ directions.T)
     return float(np.degrees(np.arccos(np.clip(cosines.min(), 0.0, 1.0))))

@@ -1,4 +1,4 @@
-"""Noise, gross outliers and hidden points, added as in the experiments of the literature."""
+"""Noise, gross outliers and hidden observations, added as in the experiments of the literature."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def corrupt_tracks(
     Parameters
     ----------
     tracks
-        Clean, or already corrupted.
+        Clean or already corrupted tracks.
     noise : float
-        r: Gaussian noise of standard deviation `σ = r · max |W|` on every coordinate, W the tracks with every frame's
-        centroid removed (Dai, Deng, He 2017, section 5; their r goes to .05).
+        r, for Gaussian noise of standard deviation `σ = r · max |W|` on every coordinate, W the tracks with every frame's
+        centroid removed (Dai, Deng, He 2017, section 5, with r up to .05).
     outliers : float
         Share of the F·P observations moved to random positions, uniform over the bounding box of the centred sequence.
     hidden : float
@@ -46,7 +46,7 @@ def corrupt_tracks(
     Returns
     -------
     tracks, outliers
-        Corrupted tracks, and a mask of the outliers, `(F, P)`.
+        Corrupted tracks, and a mask of their visible outliers, `(F, P)`.
 
     Raises
     ------

@@ -25,9 +25,9 @@ def flag(
 ) -> Sequence:
     """Return a sequence of a waving flag.
 
-    Each thread that starts at the pole is a curve with tangent angle `θ(s, v, t)`, a travelling wave whose amplitude
-    grows with the distance s from the pole. Points follow by integration, `x = ∫cos θ ds`, `z = ∫sin θ ds`, so no thread
-    stretches. The phase depends on v, which shears the cloth.
+    Each horizontal thread is a curve with tangent angle `θ(s, v, t)`, a travelling wave whose amplitude grows with the
+    distance s from the pole. Points follow by integration, `x = ∫cos θ ds`, `z = ∫sin θ ds`, so these threads do not
+    stretch. The phase depends on v, which shears the cloth.
 
     Parameters
     ----------

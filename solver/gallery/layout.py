@@ -37,7 +37,7 @@ def disc(num_points: int, mesh: Kind) -> tuple[Floats, Mesh]:
 
 
 def rectangle(num_points: int, mesh: Kind, *, aspect: float) -> tuple[Floats, Mesh]:
-    """Return points in [−1, 1]², `(P, 2)`, and their mesh, for a sheet `aspect` times as wide as it is high.
+    """Return points in [−1, 1]², `(P, 2)`, and their mesh, for a sheet `aspect` times as wide as high.
 
     The last column of the grid may be incomplete, so any P is possible.
     """
@@ -57,7 +57,7 @@ def rectangle(num_points: int, mesh: Kind, *, aspect: float) -> tuple[Floats, Me
 
 
 def _numbered(plane: Floats, inside: NDArray[np.int64]) -> tuple[Floats, Mesh]:
-    """Assign numbers to the chosen cells row by row; drop empty rows and columns."""
+    """Assign point indices to the chosen cells row by row, and drop empty rows and columns."""
     grid = np.full(plane.shape[:2], -1, dtype=np.int32)
     grid.ravel()[np.sort(inside)] = np.arange(len(inside))
     kept = np.ix_((grid >= 0).any(axis=1), (grid >= 0).any(axis=0))
@@ -66,7 +66,7 @@ def _numbered(plane: Floats, inside: NDArray[np.int64]) -> tuple[Floats, Mesh]:
 
 def _triangulate(flat: Floats) -> Ints:
     """Return Delaunay triangles, counter-clockwise when v points down, without slivers on the border."""
-    from scipy.spatial import Delaunay  # not for grids, nor for a service that only lists its examples
+    from scipy.spatial import Delaunay  # imported here because neither grids nor listing the examples need it
 
     triangles = Delaunay(flat).simplices.astype(np.int32)
     first, second = flat[triangles[:, 1]] - flat[triangles[:, 0]], flat[triangles[:, 2]] - flat[triangles[:, 0]]

@@ -12,7 +12,7 @@ from pliant.solver.mesh import Mesh
 from pliant.solver.records import Floats, Tracks, read_only
 
 PIXELS = 200.0
-"""Image pixels per model unit: half of a face's height, half of a flag's, or a sphere's radius."""
+"""Image pixels per model unit, which is half the height of a face or flag, or the radius of a sphere."""
 
 IMAGE_CENTRE = (320.0, 240.0)
 GRAZING = 0.05
@@ -32,7 +32,7 @@ class Sequence:
     """True cameras, `(F, 3, 3)`, camera from world."""
 
     scales: Floats
-    """True scales, `(F,)`; the mean of the logarithm is 0."""
+    """True scales, `(F,)`; the mean logarithm is 0."""
 
     name: str
     outliers: NDArray[np.bool_]
@@ -76,9 +76,9 @@ def film(
     mesh, rotations
         Mesh of the points; cameras, `(F, 3, 3)`.
     scale_change
-        Amplitude c of one sinusoidal period in the logarithm of the scale: image size varies by e^±c.
+        Amplitude c of one sinusoidal period in the logarithm of the scale: the size in the image varies by e^±c.
     self_occlusion
-        Hide points whose surface faces away from the camera. Exact for a convex body; occlusion by other parts is ignored.
+        Hide points whose surface faces away from the camera. Exact only for convex bodies.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def film(
 
 
 def facing(shapes: Floats, mesh: Mesh, rotations: Floats) -> NDArray[np.bool_]:
-    """Return which points face the camera, shape `(F, P)`; the viewing direction is +z."""
+    """Return a mask of the points that face the camera, shape `(F, P)`; the viewing direction is +z."""
     depth = np.stack([vertex_normals(shape, mesh) @ turn[2] for shape, turn in zip(shapes, rotations, strict=True)])
     return np.asarray(depth < -GRAZING)
 

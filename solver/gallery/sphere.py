@@ -20,7 +20,7 @@ def sphere(
     self_occlusion: bool = True,
     seed: int = 0,
 ) -> Sequence:
-    """Return a sequence of a pulsating sphere: its radius varies, and five lobes rise and sink with their own periods.
+    """Return a sequence of a pulsating sphere: its radius varies, and five lobes rise and sink with different periods.
 
     Points form a Fibonacci lattice, triangles its convex hull. By default the camera makes a full turn; with
     `self_occlusion` each point is hidden while it faces away, about half of the time.
@@ -74,7 +74,7 @@ def _lattice(num_points: int) -> Floats:
 
 def _outward(points: Floats) -> Ints:
     """Return the faces of the convex hull, counter-clockwise seen from outside."""
-    from scipy.spatial import ConvexHull  # not for a service that only lists its examples
+    from scipy.spatial import ConvexHull  # imported here because listing the examples does not need it
 
     hull = ConvexHull(points)
     faces = hull.simplices.astype(np.int32)

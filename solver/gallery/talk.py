@@ -1,4 +1,4 @@
-"""A synthetic face that talks without repeating itself: the pace of its motion does not depend on the number of frames."""
+"""A synthetic face that talks without repetition, at a pace that does not depend on the number of frames."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from pliant.solver.gallery.sequence import Sequence, about, film
 from pliant.solver.records import Floats
 
 PERIODS = np.array([[83.0, 41.0], [23.0, 13.1], [59.0, 31.7], [47.0, 29.3], [37.0, 19.9]])
-"""Frames of the two waves whose mean is the strength of an expression; no common multiple is near."""
+"""Periods, frames, of the two waves whose mean is the strength of an expression; their least common multiples are large."""
 
 HEAD = ((18.0, 211.0), (8.0, 17.3))
-"""Amplitudes, degrees, and periods, frames, of the slow and the quick part of the head's turn; nod and roll have a share of it."""
+"""Amplitude in degrees and period in frames of the slow and the fast component of the head's turn; nod and roll are scaled from these."""
 
 
 def talk(num_frames: int = 300, num_points: int = 300, *, mesh: Kind = "grid", seed: int = 0) -> Sequence:
-    """Return a sequence of a face that talks and shakes its head, for films of any length.
+    """Return a sequence of a face that talks and shakes its head, at the same pace in films of any length.
 
-    The face is that of `face`. Expressions and head follow waves whose periods are numbers of frames, so that long films hold more
-    motion, not slower motion: the head shakes in 17 frames.
+    The face is the one of `face`. Expressions and head follow waves with periods in frames, so longer films contain more motion, not slower
+    motion: the head shakes with a period of 17 frames.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def talk(num_frames: int = 300, num_points: int = 300, *, mesh: Kind = "grid", s
 
 
 def _head(num_frames: int, phases: Floats) -> Floats:
-    """Return the cameras, shape `(F, 3, 3)`: turn, nod of 0.7 and roll of 0.3 times its amplitudes."""
+    """Return the cameras, shape `(F, 3, 3)`; nod and roll have 0.7 and 0.3 times the amplitudes of the turn."""
     frames = np.arange(num_frames)[:, None]
     amplitudes, periods = np.radians([each[0] for each in HEAD]), np.array([each[1] for each in HEAD])
     turn, nod, roll = (

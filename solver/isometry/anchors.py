@@ -1,9 +1,9 @@
-"""Anchors of a surface: some well-spread points whose image positions are cleaned by their neighbours, and the graph between them.
+"""Anchors of a surface: well-spread points whose image positions are denoised with their neighbours, and the graph that connects them.
 
 A small patch of a surface is nearly rigid, and its image nearly affine in its coordinates: u_fq ≈ M_f b_q + c_f with b_q in R². The factors
-are fitted to each anchor's patch by alternating least squares with robust weights. Where the tracks are dense, an anchor takes the place
-that the patch gives it, which averages noise and fills hidden observations; where they are sparse, its own observations are kept and those
-that contradict the patch are hidden.
+are fitted to each anchor's patch by alternating least squares with robust weights. In dense tracks, the patch's prediction replaces the
+anchor's track, which averages noise and fills hidden observations. In sparse tracks, the anchor keeps its own observations, except those
+that contradict the patch.
 """
 
 from __future__ import annotations
@@ -19,40 +19,40 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 POOL = 1800
-"""Points, of the well-seen ones, that anchors and patches are taken from; bounds time and memory."""
+"""Maximum number of often visible points from which anchors and patches are drawn; bounds time and memory."""
 
 VIEWS = 24
-"""Frames in which distances between points of the pool are compared."""
+"""Maximum number of frames in which distances between points of the pool are compared."""
 
 PATCH_POINTS = (12, 40)
-"""Fewest and most points of a patch, the anchor included."""
+"""Minimum and maximum number of points of a patch, including the anchor."""
 
 DENSE = 8
-"""Points of the pool for each anchor from which the patch, not the single track, places an anchor."""
+"""Minimum number of pool points per anchor for the patch's prediction to replace the anchor's track."""
 
 SWEEPS = 16
-"""Alternations of a patch's factors. The scale of the robust weights is at least `ANNEALED`ᵏ patch radii at the k-th, so that a few
-far observations do not decide which of the others count."""
+"""Alternations of a patch's factors. In the k-th, the scale of the robust weights is at least `ANNEALED`ᵏ patch radii, so that a few
+distant observations do not determine which of the others count."""
 
 ANNEALED = 0.6
 
 GROSS = 8.0
-"""Robust standard deviations from its patch beyond which an observation is hidden."""
+"""Distance from the patch, in robust standard deviations, beyond which an observation is rejected."""
 
 FAITHFUL = 0.6
-"""Share of its frames in which an anchor's own track must agree with its patch; other points are no anchors."""
+"""Minimum share of an anchor's frames in which its track agrees with its patch; other points cannot be anchors."""
 
 RANK = 2
-"""Coordinates of a patch. With a third one for its curvature the fit follows outliers instead: they vary more than patches bend."""
+"""Coordinates of a patch. A third one for curvature would fit outliers, which vary more than patches bend."""
 
 RIDGE = 1e-6
-"""Regularises the patches' normal equations, as a share of their trace."""
+"""Ridge on the patches' normal equations, relative to their mean diagonal."""
 
 NEIGHBOURS = 15
-"""k of the graph of nearest neighbours; 10 to 20 in the paper by Chhatkuli and others."""
+"""k of the graph of nearest neighbours; Chhatkuli et al. (2018) use 10 to 20."""
 
 LARGEST_QUANTILE = 0.9
-"""Quantile over frames that stands for the largest image distance of two points, so that a few wrong ones do not separate neighbours."""
+"""Quantile over frames used as the largest image distance of two points, so that a few outliers do not separate neighbours."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,10 +63,10 @@ class Anchors:
     """Image positions, shape `(F, A, 2)`, the tracks' unit; 0 where hidden."""
 
     seen: NDArray[np.bool_]
-    """Which positions count, shape `(F, A)`."""
+    """Mask of the valid positions, shape `(F, A)`."""
 
     noise_std: float
-    """Robust standard deviation of single tracks about their patches, the tracks' unit."""
+    """Robust standard deviation of the tracks about their patches, the tracks' unit."""
 
 
 def choose_anchors(points: Floats, seen: NDArray[np.bool_], count: int) -> Anchors:
@@ -77,9 +77,9 @@ def choose_anchors(points: Floats, seen: NDArray[np.bool_], count: int) -> Ancho
     points : shape (F, P, 2)
         Tracks, any unit.
     seen : shape (F, P)
-        Which observations there are.
+        Mask of the visible observations.
     count : int
-        Anchors wanted; fewer where there are fewer points, none where none is seen often enough.
+        Requested number of anchors. Fewer are returned if fewer points qualify, possibly none.
     """
     pool = _pool(seen)
     views = unlike_frames(points[:, pool], seen[:, pool], VIEWS)
@@ -104,7 +104,7 @@ def choose_anchors(points: Floats, seen: NDArray[np.bool_], count: int) -> Ancho
 
 
 def nearest_neighbours(anchors: Anchors, *, neighbours: int = NEIGHBOURS) -> Indices:
-    """Return edges `(E, 2)` from every anchor to those whose largest image distance over frames is least."""
+    """Return edges `(E, 2)` from every anchor to the anchors that stay nearest to it in the image over all frames."""
     count = anchors.points.shape[1]
     apart = _apart(anchors.points, anchors.seen, np.arange(count), quantile=LARGEST_QUANTILE)
     together = anchors.seen.T.astype(np.float64) @ anchors.seen
@@ -118,7 +118,7 @@ def nearest_neighbours(anchors: Anchors, *, neighbours: int = NEIGHBOURS) -> Ind
 
 
 def connected(seen: NDArray[np.bool_], edges: Indices) -> NDArray[np.bool_]:
-    """Return `seen (F, A)` without what, in a frame, no path of seen neighbours joins to the frame's largest part."""
+    """Return `seen (F, A)` restricted to each frame's largest connected component of visible anchors."""
     kept = np.zeros_like(seen)
     count = seen.shape[1]
     for frame, mask in enumerate(seen):
@@ -131,7 +131,7 @@ def connected(seen: NDArray[np.bool_], edges: Indices) -> NDArray[np.bool_]:
 
 
 def farthest_points(points: Floats, seen: NDArray[np.bool_], count: int) -> Indices:
-    """Return the indices of `count` points, each as far as possible from those before it in the median frame."""
+    """Return the indices of `count` points by farthest-point sampling, with the median over frames of the image distance."""
     weight = seen[..., None]
     middle = (points * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1)
     off = np.where(seen, np.linalg.norm(points - middle[:, None], axis=2), np.nan)
@@ -146,23 +146,23 @@ def farthest_points(points: Floats, seen: NDArray[np.bool_], count: int) -> Indi
 
 
 def _pool(seen: NDArray[np.bool_]) -> Indices:
-    """Return at most `POOL` points, evenly among those seen at least half as often as the one seen most."""
+    """Return at most `POOL` points, evenly spread over those visible at least half as often as the most visible one."""
     often = seen.sum(axis=0)
     usable = np.flatnonzero(2 * often >= often.max())
     return np.asarray(usable[evenly_spread(len(usable), POOL)])
 
 
 def unlike_frames(points: Floats, seen: NDArray[np.bool_], count: int) -> Indices:
-    """Return up to `count` frames, first the one nearest to the mean image, then each as unlike as possible to those before it.
+    """Return up to `count` dissimilar frames by farthest-point sampling, starting with the frame nearest to the mean image.
 
     Parameters
     ----------
     points : shape (F, N, 2)
         Image positions; each frame's mean is subtracted first.
     seen : shape (F, N)
-        Which of them count.
+        Mask of the visible positions.
     count : int
-        Frames wanted.
+        Maximum number of frames.
     """
     frames = len(points)
     if frames <= count:
@@ -193,13 +193,13 @@ def _centred(points: Floats, seen: NDArray[np.bool_]) -> Floats:
 
 
 def _apart(points: Floats, seen: NDArray[np.bool_], some: Indices, *, quantile: float = 0.5) -> Floats:
-    """Return image distances from `some` of the points to all, a quantile over frames, `(S, N)`; infinite if never seen together."""
+    """Return a quantile over frames of the image distances from the points `some` to all, `(S, N)`; infinite without a common frame."""
     distance = np.linalg.norm(points[:, some, None] - points[:, None], axis=3)
     return _over_frames(np.where(seen[:, some, None] & seen[:, None], distance, np.nan), quantile)
 
 
 def _over_frames(values: Floats, quantile: float) -> Floats:
-    """Return the quantile over the first axis without NaN, by the nearest rank; infinite where all are NaN."""
+    """Return the nearest-rank quantile over the first axis, ignoring NaN; infinite where all are NaN."""
     ordered = np.sort(values, axis=0)  # NaN last
     counted = np.isfinite(values).sum(axis=0)
     rank = np.maximum(np.ceil(quantile * counted).astype(int) - 1, 0)
@@ -207,13 +207,13 @@ def _over_frames(values: Floats, quantile: float) -> Floats:
 
 
 def _fit_patches(points: Floats, seen: NDArray[np.bool_], patches: Indices) -> tuple[Floats, NDArray[np.bool_], float]:
-    """Return the places `(F, N, 2)` that N patches `(N, q)` give their first point, where they are trusted, and the noise."""
+    """Return the positions `(F, N, 2)` that N patches `(N, q)` predict for their first points, a mask of reliable ones, and the noise."""
     image = points[:, patches].transpose(1, 0, 2, 3)
     known = seen[:, patches].transpose(1, 0, 2)
     middle = _middle(image, known)
     image = np.where(known[..., None], image - middle, 0.0)
     radius = np.linalg.norm(image, axis=3)
-    size = float(np.median(radius[known])) or float(radius.max()) or 1.0  # most patches may be copies of one point
+    size = float(np.median(radius[known])) or float(radius.max()) or 1.0  # the median is 0 if most points coincide
     clipped = image * np.minimum(1.0, 3 * size / np.maximum(radius, 1e-12 * max(size, 1e-300)))[..., None]
     stacked = clipped.transpose(0, 1, 3, 2).reshape(len(patches), -1, patches.shape[1])
     right = np.linalg.svd(stacked, full_matrices=False)[2][:, :RANK]
@@ -240,7 +240,7 @@ def _fit_patches(points: Floats, seen: NDArray[np.bool_], patches: Indices) -> t
 
 
 def _middle(image: Floats, known: NDArray[np.bool_]) -> Floats:
-    """Return the median position of every patch in every frame, `(N, F, 1, 2)`; 0 where nothing is seen."""
+    """Return the median position of every patch in every frame, `(N, F, 1, 2)`; 0 where no point is visible."""
     masked = np.where(known[..., None], image, np.nan)
     found = _over_frames(np.moveaxis(masked, 2, 0), 0.5)[:, :, None]
     return np.where(np.isfinite(found), found, 0.0)

@@ -1,8 +1,8 @@
-"""Cross-validation of an isometric surface: two halves of the frames, each reconstructed from nothing, must have the same edge lengths.
+"""Cross-validation of an isometric surface: independent reconstructions of two halves of the frames must have the same edge lengths.
 
-A surface stretched along the viewing rays keeps its edge lengths whatever the images show, because depth alone makes them. Such a false
-minimum of the isometric inconsistency I can be deep and even single out a focal length. But the depths that make it are free: another set
-of frames leads to other lengths. Lengths of a real sheet are those of one object, so disjoint sets of frames agree about them.
+A surface stretched along the viewing rays keeps its edge lengths for any images, because depth dominates them. The isometric inconsistency
+I then has a false minimum, which can be deep and even single out a focal length. But these depths are arbitrary, so other frames lead to
+other lengths. The edge lengths of a real sheet belong to one object, so disjoint sets of frames agree on them.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from pliant.solver.isometry.refinement import refine
 from pliant.solver.records import Floats
 
 DISAGREEMENT = 0.05
-"""Largest share of the edges' length by which a half may differ from the whole. Measured: paper .001, a comic page .002, paper with 1 px of
-noise, 10 % outliers and 30 % hidden .003, rolled cylinder .002; an orthographic flag 1.6 and 5.9, a face 8.2 and 8.9."""
+"""Maximum relative difference of edge lengths between half of the frames and all. Measured: paper .001, a comic page .002, paper with 1 px
+of noise, 10 % outliers and 30 % hidden .003, rolled cylinder .002; an orthographic flag 1.6 and 5.9, a face 8.2 and 8.9."""
 
 ALIGNMENTS = 10
-"""Alternations of the rigid shape and the rotations of the frames."""
+"""Alternations between the rigid shape and the rotations of the frames."""
 
 
 def disagreement(search: FocalSearch, chosen: Tried) -> float:
-    """Return the share of the edges' length by which halves of the frames, each solved alone, differ from the whole.
+    """Return the relative difference of edge lengths between halves of the frames, each solved independently, and all frames.
 
-    The larger of the two; infinite if a half has fewer than two frames or no solution.
+    The larger one of the two halves; infinite if a half has fewer than two frames or no solution.
     """
     frames = np.sort(search.frames)
     found: list[float] = []
@@ -39,7 +39,7 @@ def disagreement(search: FocalSearch, chosen: Tried) -> float:
 
 
 def unlike(lengths: Floats, others: Floats) -> float:
-    """Return Σ|s l_e − m_e| / Σ m_e over the edges that both know, s the median of m_e/l_e; infinite if they share none."""
+    """Return Σ|s l_e − m_e| / Σ m_e over the edges with both lengths, s the median of m_e/l_e; infinite if there are none."""
     both = (lengths > 0) & (others > 0)
     if not both.any():
         return np.inf
@@ -48,7 +48,7 @@ def unlike(lengths: Floats, others: Floats) -> float:
 
 
 def deformation(points: Floats) -> float:
-    """Return by how much shapes `(F, P, 3)` deform: their distance from one rigid shape, share of the size (root mean square)."""
+    """Return the RMS distance of shapes `(F, P, 3)` from the best-fitting rigid shape, relative to their RMS size."""
     centred = points - points.mean(axis=1, keepdims=True)
     mean = centred[0]
     aligned = centred

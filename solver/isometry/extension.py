@@ -1,8 +1,8 @@
-"""From anchors to every point: a flat template of the surface and thin-plate splines over it.
+"""Extension from anchors to all points, by a flat template of the surface and thin-plate splines over it.
 
 The template flattens the graph of edge lengths (Isomap: shortest paths, then classical scaling; Tenenbaum, de Silva and Langford 2000).
-In every frame a spline from image to template places the points seen there; a point's median over frames is its template position, which
-outliers do not move. A second spline, from template to space, gives every point of every frame its place, hidden ones included.
+In every frame, a spline maps the visible points from the image to the template; the median over frames is a point's template position,
+which is robust to outliers. A second spline per frame maps all points, including hidden ones, from the template to space.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from scipy import sparse
 from scipy.sparse.csgraph import shortest_path
 
 MIN_ANCHORS = 6
-"""Seen anchors below which a frame's image is not used to place points in the template."""
+"""Minimum number of visible anchors for a frame to be used."""
 
 STIFF = 1e-3
-"""Smoothing of the splines, in units of the template's squared spread: the anchors' depths are not exact."""
+"""Smoothing of the splines, in units of the template's squared standard deviation; needed because the anchors' depths are not exact."""
 
 OUTLIER_DEVIATIONS = 8.0
-"""Robust standard deviations from the surface's image beyond which an observation is an outlier."""
+"""Distance from the surface's image, in robust standard deviations, beyond which an observation is an outlier."""
 
 SPLINE_ERROR = 3e-3
-"""Smallest such standard deviation, as a share of the image's spread: the splines are no better."""
+"""Floor of that standard deviation, relative to the standard deviation of the image: the accuracy of the splines."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extended:
-    """Every point in every frame."""
+    """Positions of all points in all frames."""
 
     points: Floats
     """Camera axes, shape `(F, P, 3)`, z away from the camera, the depths' unit."""
@@ -41,11 +41,11 @@ class Extended:
     """Observations that contradict the surface, shape `(F, P)`."""
 
     placed: NDArray[np.bool_]
-    """Points that were seen somewhere near an anchor, shape `(P,)`; the others lie in the middle of the surface."""
+    """Points with a template position, shape `(P,)`; the others are put in the middle of the surface."""
 
 
 def flatten(edges: Indices, lengths: Floats, count: int) -> Floats | None:
-    """Return template positions `(A, 2)`, spread 1, or None if the edges leave the anchors in several parts."""
+    """Return template positions `(A, 2)` with standard deviation 1; None if the graph is not connected."""
     used = lengths > 0
     graph = sparse.csr_matrix((lengths[used], (edges[used, 0], edges[used, 1])), shape=(count, count))
     paths = shortest_path(graph, directed=False)
@@ -59,11 +59,11 @@ def flatten(edges: Indices, lengths: Floats, count: int) -> Floats | None:
 
 
 def complete_anchors(points: Floats, seen: NDArray[np.bool_], template: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return anchors `(F, A, 3)` without gaps, and the frames `(F,)` that show enough of them.
+    """Return anchors `(F, A, 3)` without gaps, and a mask `(F,)` of the frames that show enough of them.
 
-    A hidden anchor is taken from the frame whose seen anchors are most alike after a rigid motion, moved by that motion and by a
-    spline, over the template, of what the motion leaves. A frame that shows too few anchors has all those of the nearest frame that
-    shows enough.
+    A hidden anchor is taken from the frame that is most similar after a rigid motion of the common anchors. It is moved by that motion,
+    and by a spline over the template that interpolates the remaining differences. A frame that shows too few anchors copies all of them
+    from the nearest frame that shows enough.
     """
     filled, enough = points.copy(), np.ones(len(points), dtype=bool)
     for frame in np.flatnonzero(~seen.all(axis=1)):
@@ -90,18 +90,18 @@ def extend(
     tracks: Floats, seen: NDArray[np.bool_], *, images: Floats, known: NDArray[np.bool_], anchors: Floats,
     template: Floats, focal: float, centre: Floats,
 ) -> Extended:  # fmt: skip
-    """Return every point in every frame.
+    """Return the positions of all points in all frames.
 
     Parameters
     ----------
     tracks, seen : shapes (F, P, 2) and (F, P)
-        Image positions and which of them count.
+        Image positions, and a mask of the visible ones.
     images, known : shapes (F, A, 2) and (F, A)
-        The anchors' image positions and which of them count.
+        Image positions of the anchors, and a mask of the visible ones.
     anchors : shape (F, A, 3)
-        The anchors in space, without gaps.
+        Anchors in camera axes, without gaps.
     template : shape (A, 2)
-        From `flatten`.
+        Template positions of the anchors, see `flatten`.
     focal, centre
         Focal length and principal point `(2,)`, pixels.
     """
@@ -124,13 +124,13 @@ def extend(
 
 
 def spline(source: Floats, values: Floats, target: Floats) -> Floats:
-    """Return the thin-plate spline through `values (N, k)` at `source (N, 2)`, evaluated at `target (M, 2)`."""
+    """Return the smoothing thin-plate spline of `values (N, k)` at `source (N, 2)`, evaluated at `target (M, 2)`."""
     count = len(source)
     affine = np.concatenate([np.ones((count, 1)), source], axis=1)
     matrix = np.zeros((count + 3, count + 3))
     matrix[:count, :count] = _kernel(source, source) + STIFF * np.eye(count)
     matrix[:count, count:], matrix[count:, :count] = affine, affine.T
-    matrix[count:, count:] = -1e-9 * np.eye(3)  # sources on one line leave the affine part open
+    matrix[count:, count:] = -1e-9 * np.eye(3)  # collinear sources do not determine the affine part
     weights = np.linalg.solve(matrix, np.concatenate([values, np.zeros((3, values.shape[1]))]))
     return np.asarray(_kernel(target, source) @ weights[:count] + weights[count] + target @ weights[count + 1 :])
 
@@ -144,7 +144,7 @@ def _kernel(target: Floats, source: Floats) -> Floats:
 def _placed(
     tracks: Floats, seen: NDArray[np.bool_], images: Floats, known: NDArray[np.bool_], template: Floats
 ) -> Floats:
-    """Return template positions `(P, 2)`: the median over frames; NaN for points that no usable frame shows."""
+    """Return template positions `(P, 2)`, medians over frames; NaN for points in no usable frame or far outside the template."""
     found = np.full((*seen.shape, 2), np.nan)
     for frame in np.flatnonzero(known.sum(axis=1) >= MIN_ANCHORS):
         source = images[frame, known[frame]]
@@ -154,12 +154,12 @@ def _placed(
     place = np.full((seen.shape[1], 2), np.nan)
     ever = np.isfinite(found[..., 0]).any(axis=0)
     place[ever] = np.nanmedian(found[:, ever], axis=0)
-    # beyond the anchors by more than the template's width is not on the surface
+    # A point that lies beyond the anchors by more than the template's width is not on the surface.
     return np.where(np.abs(place).max(axis=1, keepdims=True) <= 3 * np.abs(template).max(), place, np.nan)
 
 
 def _alike(points: Floats, seen: NDArray[np.bool_], frame: int) -> Indices:
-    """Return the other frames, most alike first: least distance between seen anchors after a rigid motion."""
+    """Return the frames that share `MIN_ANCHORS` anchors with a frame, sorted by their distance after a rigid motion."""
     distance = np.full(len(points), np.inf)
     for other in range(len(points)):
         both = seen[frame] & seen[other]
@@ -170,7 +170,7 @@ def _alike(points: Floats, seen: NDArray[np.bool_], frame: int) -> Indices:
 
 
 def _moved(source: Floats, target: Floats, used: NDArray[np.bool_]) -> Floats:
-    """Return all of `source (A, 3)` after the rigid motion that brings its used points nearest to those of `target`."""
+    """Return `source (A, 3)` after the rigid motion that aligns its `used` points with those of `target`."""
     here, there = source[used].mean(axis=0), target[used].mean(axis=0)
     turn = procrustes((target[used] - there).T @ (source[used] - here), proper=True)
     return np.asarray((source - here) @ turn.T + there)

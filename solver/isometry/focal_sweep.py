@@ -1,8 +1,8 @@
-"""Search of the focal length by the isometric inconsistency, and the rule by which isometry is accepted.
+"""Search for the focal length by the isometric inconsistency, and the criterion for accepting isometry.
 
-The inconsistency I is the share of the edges' length that changes from frame to frame. As a function of the focal length it has its
-minimum at the true one wherever perspective is strong enough, and is flat, large or monotone elsewhere. Each focal length starts from
-the depths of a neighbouring one, the first from the conic program.
+The inconsistency I is the relative change of the edge lengths from frame to frame. As a function of the focal length, it has its minimum at
+the true one if perspective is strong enough; otherwise it is flat, large or monotone. Each focal length starts from the depths of a
+neighbouring one, the first from the conic program.
 """
 
 from __future__ import annotations
@@ -18,41 +18,41 @@ from pliant.solver.isometry.refinement import Isometry, refine
 from pliant.solver.records import Floats
 
 MAX_INCONSISTENCY = 0.012
-"""Largest I that is accepted. Measured: paper .002 and, with 1 px of noise, .003; a comic page .005; faces, bodies .035 to .07."""
+"""Maximum I of an isometric surface. Measured: paper .002 and, with 1 px of noise, .003; a comic page .005; faces, bodies .035 to .07."""
 
 CLEAR = 1.25
-"""How many times larger I must be at the neighbouring focal lengths. Measured: paper and page 1.8 to 2.9; faces at most 1.1."""
+"""Minimum ratio of I at the neighbouring focal lengths to the minimum. Measured: paper and page 1.8 to 2.9; faces at most 1.1."""
 
 RISE = 0.002
-"""By how much I must be larger at the neighbouring focal lengths. Measured: paper and page .003 to .006; a shallow face seen without
-perspective, which some false focal length bends into an isometric one, at most .0008."""
+"""Minimum increase of I at the neighbouring focal lengths. Measured: paper and page .003 to .006; a shallow face seen without perspective,
+which a false focal length can make isometric, at most .0008."""
 
 DIP = 0.8
-"""Going away from the least, I must not fall below this share of what it was: several minima are no evidence."""
+"""Minimum ratio of I to its running maximum with growing distance from the minimum: several minima are no evidence."""
 
 FOCAL_STEP = 1.5
 """Ratio of neighbouring focal lengths."""
 
 FOCAL_RANGE = (0.2, 6.0)
-"""Focal lengths searched, over the image's diagonal."""
+"""Range of focal lengths searched, in image diagonals."""
 
 GOLDEN_STEPS = 4
-"""Golden-section steps within the bracket, which leave 6 % of uncertainty either way before the parabola."""
+"""Evaluations of golden-section search, which narrow the bracket to about ±10 % before the parabola is fitted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FocalSearch:
-    """What stays the same for all focal lengths."""
+    """Data common to all focal lengths."""
 
     anchors: Anchors
     edges: NDArray[np.intp]
-    """Between anchors, shape `(E, 2)`."""
+    """Edges between anchors, shape `(E, 2)`."""
 
     seen: NDArray[np.bool_]
-    """Anchors' observations that hang together in their frame, shape `(F, A)`."""
+    """Mask of the visible anchors in the largest connected component of their frame, shape `(F, A)`."""
 
     frames: NDArray[np.intp]
-    """Frames that are compared."""
+    """Frames used to compare focal lengths."""
 
     centre: Floats
     """Principal point, shape `(2,)`."""
@@ -61,11 +61,11 @@ class FocalSearch:
 
     @property
     def stopped(self) -> bool:
-        """Whether to end."""
+        """Whether a stop has been requested."""
         return self.should_stop is not None and self.should_stop()
 
     def graph(self, focal: float, frames: NDArray[np.intp] | slice = slice(None)) -> SurfaceGraph:
-        """Return the rays and edges of some frames at a focal length."""
+        """Return the rays and edges of the given frames at a focal length."""
         rays = (self.anchors.points[frames] - self.centre) / focal
         rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2)
         return SurfaceGraph(rays, self.seen[frames], self.edges)
@@ -80,7 +80,7 @@ class Tried:
 
 
 def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) -> list[Tried]:
-    """Return the focal lengths tried: the given or typical one, downhill by `FOCAL_STEP`, and, unless `given`, within the bracket."""
+    """Return the isometries tried: from the first focal length downhill by `FOCAL_STEP` and, unless `given`, within the bracket."""
     first = tried_at(search, focal, None)
     if first is None:
         return []
@@ -97,7 +97,7 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
     if not given and max(values) - min(values) >= RISE:
         tried += _golden(search, min(tried, key=lambda each: each.found.inconsistency))
         least = min(tried, key=lambda each: each.found.inconsistency)
-        for side in (-1, 1):  # the search may have moved away from the neighbours it began with
+        for side in (-1, 1):  # the new minimum may lack a neighbour at the distance of a step
             if not any(side * np.log(t.focal / least.focal) >= 0.9 * np.log(FOCAL_STEP) for t in tried):
                 further = tried_at(search, least.focal * FOCAL_STEP**side, least)
                 tried += [further] if further is not None else []
@@ -105,7 +105,7 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
 
 
 def _golden(search: FocalSearch, middle: Tried) -> list[Tried]:
-    """Return what golden-section search tries within a step of the least focal length, and the vertex of a parabola at the end."""
+    """Return the isometries tried by golden-section search within one step of `middle`, and at the vertex of the final parabola."""
     share = (np.sqrt(5) - 1) / 2
     low, high = np.log(middle.focal / FOCAL_STEP), np.log(middle.focal * FOCAL_STEP)
     made: list[Tried] = []
@@ -141,7 +141,7 @@ def _golden(search: FocalSearch, middle: Tried) -> list[Tried]:
 
 
 def tried_at(search: FocalSearch, focal: float, near: Tried | None) -> Tried | None:
-    """Return the isometry at a focal length, from a neighbouring one's depths or from the conic program."""
+    """Return the isometry at a focal length, started from the depths at `near` or, if that is None, from the conic program."""
     graph = search.graph(focal, search.frames)
     if near is None:
         depths = maximum_depth(graph, should_stop=search.should_stop)
@@ -151,13 +151,13 @@ def tried_at(search: FocalSearch, focal: float, near: Tried | None) -> Tried | N
 
 
 def _carried(depths: Floats, seen: NDArray[np.bool_], ratio: float) -> Floats:
-    """Return depths for a focal length `ratio` times as long: the same relief, further away."""
+    """Return depths for a focal length `ratio` times as long: the same relief at `ratio` times the distance."""
     mean = depths.sum(axis=1, keepdims=True) / np.maximum(seen.sum(axis=1, keepdims=True), 1)
     return np.where(seen, np.maximum(ratio * mean + (depths - mean), 0.05 * ratio * mean), 0.0)
 
 
 def judged(tried: list[Tried], least: Tried) -> tuple[bool, str]:
-    """Return whether I is small and clearly smaller than at the neighbouring focal lengths, and the sentence."""
+    """Return whether I is small and clearly smaller than at the neighbouring focal lengths, and a sentence for the report."""
     value = least.found.inconsistency
     sides = [
         min((t.found.inconsistency for t in tried if (t.focal - least.focal) * side > 0
@@ -168,7 +168,7 @@ def judged(tried: list[Tried], least: Tried) -> tuple[bool, str]:
     if value > MAX_INCONSISTENCY:
         return False, f"Not an isometric sheet: edge lengths change by {value:.1%} or more, whatever the focal length."
     if not (ratio >= CLEAR and min(sides) - value >= RISE and _single(tried, least)):
-        return False, "Not taken as an isometric sheet: its edge lengths do not single out a focal length."
+        return False, "Rejected as an isometric sheet: its edge lengths do not single out a focal length."
     return True, (
         f"Taken as an isometric sheet: at a focal length of {least.focal:.0f} px edge lengths change by {value:.2%}, "
         f"{ratio:.1f} times as much at neighbouring focal lengths."
@@ -176,7 +176,7 @@ def judged(tried: list[Tried], least: Tried) -> tuple[bool, str]:
 
 
 def _single(tried: list[Tried], least: Tried) -> bool:
-    """Return whether I rises on both sides of its minimum."""
+    """Return whether I rises on both sides of its minimum, within the tolerance `DIP`."""
     for side in (-1, 1):
         away = sorted((t for t in tried if (t.focal - least.focal) * side > 0), key=lambda each: side * each.focal)
         values = np.array([each.found.inconsistency for each in away])

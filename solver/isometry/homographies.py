@@ -1,7 +1,7 @@
-"""How nearly the tracks are those of a plane, seen by a perspective camera.
+"""Distance of the tracks from images of a plane, seen by a perspective camera.
 
-Two pictures of a plane are related by a homography, however near the camera is and however far it turns (Hartley and Zisserman, *Multiple
-View Geometry in Computer Vision*, 2004, chapter 13). The singular values of the tracks are those of a plane only for a distant camera.
+A homography relates any two images of a plane, for any distance and rotation of the camera (Hartley and Zisserman, *Multiple View Geometry
+in Computer Vision*, 2004, chapter 13). The singular values of the tracks reveal a plane only if the camera is distant.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from pliant.solver.isometry.anchors import Anchors
 from pliant.solver.records import Floats
 
 FEWEST_COMMON = 8
-"""Anchors that two frames must share; a homography has eight parameters, and four points determine it."""
+"""Minimum number of common anchors of two frames; a homography has eight parameters, which four points determine."""
 
 
 def off_homography(anchors: Anchors) -> float:
-    """Return by how much the pictures differ from homographies of one of them, share of the size of the object in the picture.
+    """Return the distance of the frames from homographies of a reference frame, relative to the object's size in the image.
 
-    The median over the other frames of the median distance of the anchors, for the picture for which it is least; infinite where no two
-    frames share `FEWEST_COMMON` anchors.
+    The median over the other frames of the median distance of the anchors, minimised over the reference frame; infinite if no two frames
+    share `FEWEST_COMMON` anchors.
     """
     frames = range(len(anchors.seen))
     least = np.inf
@@ -36,10 +36,10 @@ def off_homography(anchors: Anchors) -> float:
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def unlike_homography(points: Floats, others: Floats) -> float:
-    """Return the median distance of points `(N, 2)`, after a homography, from the others, `(N, 2)`.
+    """Return the median distance between `others (N, 2)` and the image of `points (N, 2)` under the best homography.
 
-    The homography is that of the normalized direct linear transform, the unit the root mean square distance of the others from their
-    mean; infinite where points are sent to infinity.
+    The normalized direct linear transform gives the homography. The unit is the RMS distance of `others` from their mean; points mapped
+    to infinity count as infinitely far.
     """
     ours, theirs = _normalized(points), _normalized(others)
     one, none = np.ones((len(ours), 1)), np.zeros((len(ours), 3))

@@ -5,8 +5,8 @@ Chhatkuli, Pizarro, Collins and Bartoli, "Inextensible non-rigid structure-from-
 
     ‖z_fi r_fi − z_fj r_fj‖ ≤ d_ij   for neighbours i, j seen together in frame f,    Σ d_ij = 1,    z ≥ 0.
 
-A surface that bends without stretching keeps its geodesic distances d_ij, which bound every Euclidean distance. Neither a start
-nor a template is needed. A hidden observation has no variable and no cone. The frames are exchangeable: their order has no effect.
+A surface that bends without stretching keeps its geodesic distances d_ij, which bound the Euclidean distances. The problem needs neither a
+starting point nor a template. Hidden observations have no variables and no cones. The order of the frames has no effect.
 """
 
 from __future__ import annotations
@@ -22,43 +22,44 @@ from scipy import sparse
 Indices = NDArray[np.intp]
 
 SOLVED = ("Solved", "AlmostSolved")
-"""Results of Clarabel that are used."""
+"""Accepted exit statuses of Clarabel."""
 
 ACCURACY = 1e-5
-"""Relative gap and feasibility at which the conic program ends; the refinement that follows moves depths by 1e-2."""
+"""Tolerances of gap and feasibility of the conic program; the subsequent refinement changes depths by 1e-2."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceGraph:
-    """Rays of one set of points, and the edges that keep their lengths."""
+    """Viewing rays of points, and the edges between them whose lengths are constant."""
 
     rays: Floats
     """Viewing rays, shape `(F, A, 3)`, third coordinate 1."""
 
     seen: NDArray[np.bool_]
-    """Observations that count, shape `(F, A)`."""
+    """Mask of the visible points, shape `(F, A)`."""
 
     edges: Indices
-    """Neighbours, shape `(E, 2)`."""
+    """Pairs of neighbours, shape `(E, 2)`."""
 
     @property
     def pairs(self) -> tuple[Indices, Indices]:
-        """Frame and edge of every edge whose two ends are seen in that frame, in the order of the frames."""
+        """Frame and edge index of every edge with both ends visible in a frame, sorted by frame."""
         frame, edge = np.nonzero(self.seen[:, self.edges[:, 0]] & self.seen[:, self.edges[:, 1]])
         return frame, edge
 
     @property
     def ends(self) -> tuple[Indices, Indices]:
-        """For every pair, the numbers of its two observations among the seen ones, frame by frame."""
+        """Indices of the two observations of every pair among the visible ones, numbered frame by frame."""
         number = np.cumsum(self.seen.ravel()).reshape(self.seen.shape) - 1
         frame, edge = self.pairs
         return number[frame, self.edges[edge, 0]], number[frame, self.edges[edge, 1]]
 
 
 def maximum_depth(graph: SurfaceGraph, *, should_stop: Callable[[], bool] | None = None) -> Floats | None:
-    """Return depths `(F, A)` of the deepest inextensible surface, 0 where hidden; the unit makes Σ d_ij = 1.
+    """Return depths `(F, A)` of the deepest inextensible surface, in units of Σ d_ij; 0 where hidden.
 
-    None if no two neighbours are seen together, if Clarabel finds no solution, or once `should_stop` returns True between its steps.
+    Return None if no two neighbours are visible together, if Clarabel finds no solution, or if `should_stop` returns True between its
+    iterations.
     """
     if len(graph.pairs[0]) == 0:
         return None
@@ -71,9 +72,9 @@ def maximum_depth(graph: SurfaceGraph, *, should_stop: Callable[[], bool] | None
 
 
 def _gain(graph: SurfaceGraph) -> Floats:
-    """Return the weight of every seen depth in the sum, shape `(O,)`: the frame's pairs per observation, relative to the most.
+    """Return the weight g of every visible depth, shape `(O,)`: the frame's number of pairs per observation, relative to the maximum.
 
-    A frame of few pairs reaches large depths when their few lengths take all of Σ d; with equal weights it would, and the others collapse.
+    With equal weights, the lengths of a frame with few pairs could take all of Σ d: its depths would grow, and all others collapse.
     """
     counts = graph.seen.sum(axis=1)
     ratio = np.bincount(graph.pairs[0], minlength=len(counts)) / np.maximum(counts, 1)
@@ -81,7 +82,7 @@ def _gain(graph: SurfaceGraph) -> Floats:
 
 
 def _program(graph: SurfaceGraph) -> tuple[sparse.csc_matrix, Floats]:
-    """Return matrix and bound of s = b − A x ∈ K, x = (depths, d): Σ d = 1, then z ≥ 0, then one cone of size 4 a pair."""
+    """Return A and b of s = b − A x ∈ K, x = (depths, d). The rows are Σ d = 1, then z ≥ 0, then a cone of size 4 per pair."""
     _, edge = graph.pairs
     rays, (first, second) = graph.rays[graph.seen], graph.ends
     count, edges, pairs = len(rays), len(graph.edges), len(edge)
@@ -103,8 +104,8 @@ def _program(graph: SurfaceGraph) -> tuple[sparse.csc_matrix, Floats]:
 def _solved(
     matrix: sparse.csc_matrix, bound: Floats, *, gain: Floats, cones: int, should_stop: Callable[[], bool] | None
 ) -> Floats | None:
-    """Return the depths of the seen observations."""
-    import clarabel  # only sequences that look like a sheet need it
+    """Return the depths of the visible observations."""
+    import clarabel  # imported here because only sequences that look like a sheet need it
 
     variables, observations = matrix.shape[1], len(gain)
     cost = np.zeros(variables)

@@ -1,9 +1,9 @@
-"""Refine depths so that edges keep their lengths from frame to frame.
+"""Refinement of depths so that edges keep their lengths from frame to frame.
 
 Minimise Σ_fe ρ(‖x_fi − x_fj‖ − l_e) over log depths ζ and edge lengths l, x_fi = exp(ζ_fi) r_fi. ρ is the soft-L1 loss
-ε² (√(1 + (r/ε)²) − 1), so that an observation which does not move with the surface loses its influence. Σ l_e stays what it was,
-which fixes the free scale. Gauss–Newton steps with Levenberg–Marquardt damping; the normal equations are solved by conjugate gradients
-whose preconditioner inverts each frame's own block, because only the lengths couple the frames.
+ε² (√(1 + (r/ε)²) − 1), which limits the influence of observations that do not move with the surface. Σ l_e is kept constant, which fixes
+the free scale. Gauss–Newton steps with Levenberg–Marquardt damping; the normal equations are solved by conjugate gradients with a
+block-diagonal preconditioner, one block per frame, because only the lengths couple the frames.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ CONVERGED = 1e-4
 """Relative decrease of the objective below which refinement ends."""
 
 EASE = 0.75
-"""ε over the median |residual| at the start: where the loss turns from L2 to L1."""
+"""ε, the residual at which the loss turns from L2 to L1, relative to the median |residual| at the start."""
 
 MIN_EASE = 1e-4
-"""Smallest ε, as a share of the mean edge length: exact data are fitted by plain least squares."""
+"""Minimum ε relative to the mean edge length: exact data are fitted by plain least squares."""
 
 MOST_DAMPED = 1e4
-"""Damping, relative to the diagonal, at which no smaller step is tried."""
+"""Maximum damping relative to the diagonal; if no step with less lowers the cost, refinement ends."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Isometry:
-    """Depths, and how well they keep lengths."""
+    """Depths, edge lengths, and their inconsistency."""
 
     depths: Floats
     """Shape `(F, A)`; 0 where hidden."""
 
     lengths: Floats
-    """l_e, shape `(E,)`, the depths' unit; 0 where the ends are never seen together."""
+    """l_e, shape `(E,)`, the depths' unit; 0 where the ends are never visible together."""
 
     inconsistency: float
     """I = Σ |L_fe − median_f L_e| / Σ L_fe."""
@@ -64,7 +64,7 @@ def edge_lengths(graph: SurfaceGraph, depths: Floats) -> Floats:
 
 
 def typical(lengths: Floats) -> Floats:
-    """Return the median over frames of lengths `(F, E)` with NaN where hidden; 0 for edges that are never seen."""
+    """Return the median over frames of lengths `(F, E)`, ignoring NaN; 0 for edges that are never visible."""
     result = np.zeros(lengths.shape[1])
     ever = np.isfinite(lengths).any(axis=0)
     result[ever] = np.nanmedian(lengths[:, ever], axis=0)
@@ -72,21 +72,21 @@ def typical(lengths: Floats) -> Floats:
 
 
 def inconsistency(lengths: Floats) -> float:
-    """Return I = Σ |L_fe − median_f L_e| / Σ L_fe of lengths `(F, E)`; edges seen once do not count, infinite if none is left."""
+    """Return I = Σ |L_fe − median_f L_e| / Σ L_fe over the edges visible in two or more frames; infinite if there are none."""
     used = lengths[:, np.isfinite(lengths).sum(axis=0) >= 2]
     total = float(np.nansum(used))
     return float(np.nansum(np.abs(used - typical(used)))) / total if total > 0 else float("inf")
 
 
 def residuals(graph: SurfaceGraph, log_depths: Floats, lengths: Floats) -> tuple[Floats, sparse.csr_matrix]:
-    """Return ‖x_fi − x_fj‖ − l_e of every pair `(N,)`, and its Jacobian `(N, O + E)` by the O seen log depths and the lengths.
+    """Return ‖x_fi − x_fj‖ − l_e of every pair `(N,)`, and its Jacobian `(N, O + E)` in O visible log depths and E lengths.
 
     Parameters
     ----------
     graph : SurfaceGraph
         F frames of A points.
     log_depths : shape (O,)
-        ζ of the seen observations, frame by frame.
+        ζ of the visible observations, frame by frame.
     lengths : shape (E,)
         l_e.
     """
@@ -107,18 +107,18 @@ def residuals(graph: SurfaceGraph, log_depths: Floats, lengths: Floats) -> tuple
 def refine(
     graph: SurfaceGraph, depths: Floats, *, iterations: int = 30, should_stop: Callable[[], bool] | None = None
 ) -> Isometry:
-    """Return depths of unchanging edge lengths near the given ones.
+    """Return depths with nearly constant edge lengths, close to the given ones.
 
     Parameters
     ----------
     graph : SurfaceGraph
-        At least one edge is seen.
+        Must have at least one visible edge.
     depths : shape (F, A)
-        Start, positive where seen.
+        Starting depths, positive where visible.
     iterations : int
-        Gauss–Newton steps at most.
+        Maximum number of Gauss–Newton steps.
     should_stop : callable, optional
-        Called between steps; once it returns True, the best so far is returned.
+        Called between steps; once it returns True, the best depths so far are returned.
     """
     lengths = typical(edge_lengths(graph, depths))
     floor = 1e-6 * float(depths.max())
@@ -147,12 +147,12 @@ def _at(graph: SurfaceGraph, log_depths: Floats, lengths: Floats, ease: float) -
 
 
 def _lower(graph: SurfaceGraph, here: _Point, damping: float, ease: float) -> tuple[_Point | None, float]:
-    """Return the iterate after one step that lowers the cost, None if no step does, and the damping for the next."""
+    """Return the next iterate of lower cost, or None if no step lowers it, and the damping of the next step."""
     weight = 1 / np.hypot(1.0, here.residuals / ease)
     weighted = sparse.csr_matrix(sparse.diags(weight) @ here.jacobian)
     normal = (here.jacobian.T @ weighted).tocsr()
     gradient = weighted.T @ here.residuals
-    factor = 0.1  # after a step that failed, the damping that succeeded is kept
+    factor = 0.1  # 1 after a failed step, so that the damping that succeeds is kept
     while damping <= MOST_DAMPED:
         move = _step(normal, gradient, damping, graph.seen.sum(axis=1))
         log_depths = here.log_depths + move[: len(here.log_depths)]

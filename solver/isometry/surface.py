@@ -1,11 +1,10 @@
-"""A sheet that bends without stretching, seen by a pinhole camera: its shapes and, where it is not given, the focal length.
+"""Reconstruction of a sheet that bends without stretching, seen by a pinhole camera, and of its focal length if that is not given.
 
-Maximum depth (`inextensible`) gives a start, refinement on the isometry itself (`refinement`) the depths of some anchors, splines
-(`extension`) those of all points. The isometric inconsistency I, the share of the edges' length that changes from frame
-to frame, is computed without ground truth. As a function of the focal length it has its minimum at the true one wherever perspective is
-strong enough for the method to work, and is large or flat elsewhere. Isometry is therefore accepted only where I is small,
-clearly smaller than at the neighbouring focal lengths, and where halves of the frames lead to the same edge lengths
-(`confirmation`). The order of the frames has no effect.
+The maximum-depth heuristic (`inextensible`) gives starting depths of the anchors, `refinement` makes their edge lengths constant, and
+splines (`extension`) extend them to all points. The isometric inconsistency I, the relative change of the edge lengths from frame to frame,
+needs no ground truth. As a function of the focal length, it has its minimum at the true one if perspective is strong enough for the method
+to work; otherwise it is large or flat. Isometry is therefore accepted only if I is small and clearly smaller than at the neighbouring focal
+lengths, and if halves of the frames lead to the same edge lengths (`confirmation`). The order of the frames has no effect.
 """
 
 from __future__ import annotations
@@ -25,91 +24,91 @@ from pliant.solver.isometry.refinement import Isometry, edge_lengths, inconsiste
 from pliant.solver.records import Floats, Tracks
 
 ANCHORS = 60
-"""Points that the conic program places; its time grows with their number times the frames."""
+"""Number of points in the conic program; its time grows with their number times the number of frames."""
 
 SOLVED_FRAMES = 24
-"""Frames of the conic program and of the focal lengths' comparison; the others start from the most similar one of these."""
+"""Number of frames used in the conic program and to compare focal lengths; the others start from the most similar one of these."""
 
 SHEETLIKE = 0.06
-"""Distance of the pictures from homographies of each other, share of the size, below which `auto` tries isometry. Measured: sheets rolled
-up to half a cylinder .004 to .055, paper .028 and .040 with all errors, a comic page .042 and .052; a back .027, heads .02 to .06,
-other bodies from .065 on."""
+"""Distance of the frames from homographies of a reference frame, relative to the size, above which `auto` does not test isometry.
+Measured: sheets rolled up to half a cylinder .004 to .055, paper .028 and .040 with all errors, a comic page .042 and .052; a back .027,
+heads .02 to .06, other bodies .065 or more."""
 
 HOPELESS = 0.03
-"""I of a small part at the first focal length above which `auto` tries no more. Measured: paper and page from half to four times the true
-one .003 to .022; faces .037 to .068."""
+"""I of the subset `SMALL_PART` at the first focal length above which `auto` rejects isometry. Measured: paper and page at half to four
+times the true focal length .003 to .022; faces .037 to .068."""
 
 SMALL_PART = (30, 12, 10)
-"""Anchors, frames and neighbours of that part."""
+"""Numbers of anchors, frames and neighbours in the subset of the first test."""
 
 TYPICAL_FOCAL = 0.8
-"""First focal length tried, over the image's diagonal: about 64° across it."""
+"""First focal length tried, in image diagonals: a diagonal angle of view of about 64°."""
 
 LAST_NEIGHBOURS = 8
-"""Neighbours in the last refinement. Measured, error of a cylinder rolled ever tighter .015 → .007, a cone .084 → .054, paper .0187 →
-.0179; with 5 no less."""
+"""Number of neighbours in the last refinement, fewer than `NEIGHBOURS`. Measured errors before → after it: a cylinder rolled ever tighter
+.015 → .007, a cone .084 → .054, paper .0187 → .0179; 5 neighbours give no further gain."""
 
 DIAGONAL_MARGIN = 1.3
-"""Image diagonal over that of the box around all tracks, where the image's size is not given."""
+"""Ratio of the image diagonal to the diagonal of the tracks' bounding box, assumed if the image size is not given."""
 
 FIRST_LOOK = 200
-"""Points that say which frames differ most."""
+"""Approximate number of points used to choose dissimilar frames and to measure deformation."""
 
-TOO_LITTLE = "Too few points are seen together for an isometric surface."
+TOO_LITTLE = "Too few points are visible in the same frames for an isometric surface."
 
 FEWEST_ANCHORS = 6
-"""Anchors below which there is no surface to speak of."""
+"""Minimum number of anchors of a surface, in total and per frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class FocalCandidate:
-    """One focal length that was tried."""
+    """A focal length that was tried."""
 
     focal: float
     """Pixels."""
 
     inconsistency: float
-    """I, see the module."""
+    """Isometric inconsistency I."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IsometricVerdict:
-    """Whether the tracks are those of an isometric surface, and the surface if they are."""
+    """Whether the tracks show an isometric surface, and the surface if they do."""
 
     reason: str
-    """One sentence for the report."""
+    """Sentences for the report."""
 
     candidates: tuple[FocalCandidate, ...] = ()
-    """In the order in which they were tried."""
+    """Focal lengths in the order in which they were tried."""
 
     surface: IsometricSurface | None = None
-    """None where isometry is not taken."""
+    """None if isometry is rejected."""
 
     warnings: tuple[str, ...] = ()
-    """Sentences the user should read."""
+    """Warnings for the user."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IsometricSurface:
-    """Shapes before each frame's camera."""
+    """Shapes in the axes of each frame's camera."""
 
     points: Floats
-    """Camera axes, x right, y down, z away, shape `(F, P, 3)`; one free scale for the sequence."""
+    """Camera axes, x right, y down, z away, shape `(F, P, 3)`; the sequence has one free scale."""
 
     outliers: NDArray[np.bool_]
     """Observations that contradict the surface, shape `(F, P)`."""
 
     placed: NDArray[np.bool_]
-    """Points with a place on the surface, shape `(P,)`."""
+    """Points with a position on the surface, shape `(P,)`."""
 
     shown: NDArray[np.bool_]
-    """Frames that show enough of the surface, shape `(F,)`; each other one has the shape of the nearest of these."""
+    """Frames that show enough of the surface, shape `(F,)`; every other frame copies the shape of the nearest of these."""
 
     focal: float
-    """Pixels, given or found."""
+    """Given or estimated focal length, pixels."""
 
     principal_point: tuple[float, float]
-    """Pixels, given or assumed."""
+    """Given or assumed principal point, pixels."""
 
     inconsistency: float
     """I of the anchors over all frames."""
@@ -127,22 +126,22 @@ def isometric_surface(
     required: bool = False,
     should_stop: Callable[[], bool] | None = None,
 ) -> IsometricVerdict:
-    """Decide whether the tracks are those of an isometric surface, and reconstruct it.
+    """Decide whether the tracks show an isometric surface, and reconstruct it.
 
     Parameters
     ----------
     tracks : Tracks
         Pixels, x right, y down.
     focal : float, optional
-        Focal length in pixels; None searches it.
+        Focal length in pixels; None searches for it.
     principal_point : (x, y), optional
-        Pixels; None takes the centre of the image, or that of the tracks where `image_size` is not given.
+        Pixels; None takes the image centre, or the median of the tracks if `image_size` is not given.
     image_size : (width, height), optional
         Pixels.
     required : bool
-        Return the surface even if the evidence is weak, with a warning; only where there is none at all, none is returned.
+        Return the surface, with a warning, even if the evidence is weak. The surface is None only if no surface could be computed.
     should_stop : callable, optional
-        Called between units of work; once it returns True, the verdict is that isometry is not taken.
+        Called between units of work. If it returns True during the search, isometry is rejected; later, refinement ends early.
     """
     seen, diagonal = tracks.visible > 0, _diagonal(tracks, image_size)
     centre = _centre(tracks, principal_point, image_size)
@@ -156,7 +155,7 @@ def isometric_surface(
         return IsometricVerdict(against or TOO_LITTLE)
     tried = sweep(search, first, diagonal, given=focal is not None)
     if search.stopped:
-        return IsometricVerdict("Stopped before it was known whether the surface is isometric.", _trace(tried))
+        return IsometricVerdict("Stopped before the test for isometry had finished.", _trace(tried))
     if not tried:
         return IsometricVerdict("No isometric surface was found: the conic program has no solution.", _trace(tried))
     least = min(tried, key=lambda each: each.found.inconsistency)
@@ -168,41 +167,43 @@ def isometric_surface(
         return IsometricVerdict(why, _trace(tried))
     surface = _everywhere(search, tracks, seen, chosen)
     if surface is None:
-        return IsometricVerdict("No isometric surface was found: its points do not hang together.", _trace(tried))
+        return IsometricVerdict("No isometric surface was found: its points are not connected.", _trace(tried))
     if not required and (rigid := _rigid(search, surface)) is not None:
         return IsometricVerdict(rigid, _trace(tried))
     return IsometricVerdict(why, _trace(tried), surface, _warnings(clear, focal, least, chosen))
 
 
 def _implausible(search: FocalSearch | None, focal: float, required: bool) -> str | None:
-    """Return why there is no isometric sheet to look for; None if there may be one."""
+    """Return the reason why the tracks cannot show an isometric sheet; None if they may."""
     if search is None:
         return TOO_LITTLE
     if required:
         return None
     off = off_homography(search.anchors)
     if off > SHEETLIKE:
-        return f"Not tried as an isometric sheet: the pictures differ from those of a plane by {off:.1%} of its size."
+        return f"Isometry was not tested: the pictures differ from those of a plane by {off:.1%} of its size."
     changes = _glance(search, focal)
     return (
-        f"Not an isometric sheet: edge lengths of a part of it change by {changes:.1%}." if changes > HOPELESS else None
+        f"Not an isometric sheet: edge lengths of some of its points change by {changes:.1%}."
+        if changes > HOPELESS
+        else None
     )
 
 
 def _confirmed(search: FocalSearch, chosen: Tried, why: str) -> tuple[bool, str]:
-    """Return whether halves of the frames lead to the same surface, and the sentence."""
+    """Return whether halves of the frames lead to the same edge lengths, and a sentence for the report."""
     share = disagreement(search, chosen)
     if share > DISAGREEMENT:
         change = "by more than their length" if share > 1 else f"by {share:.0%}"
-        return False, f"Not taken as an isometric sheet: its edge lengths differ {change} between halves of the frames."
-    return True, f"{why} Halves of the frames agree about the lengths to {share:.1%}."
+        return False, f"Rejected as an isometric sheet: its edge lengths differ {change} between halves of the frames."
+    return True, f"{why} Halves of the frames agree on the lengths to within {share:.1%}."
 
 
 def _rigid(search: FocalSearch, surface: IsometricSurface) -> str | None:
-    """Return why the surface is that of a rigid solid, None if it bends.
+    """Return the reason why the surface is a rigid solid; None if it bends.
 
-    Pictures of a sheet differ from those of a plane because it bends, those of a solid because of its depth, which stays. A rigid solid
-    keeps all lengths as well, but a free surface determines it exactly: .0002 for a rigid face, .05 as a sheet.
+    Images of a sheet differ from images of a plane because the sheet bends; images of a solid differ because of its constant depth. A rigid
+    solid also keeps all lengths, but it is better solved as a free surface: the error of a rigid face is .0002, and .05 as a sheet.
     """
     some = replace(search.anchors, points=search.anchors.points[search.frames], seen=search.seen[search.frames])
     off = off_homography(some)
@@ -210,13 +211,13 @@ def _rigid(search: FocalSearch, surface: IsometricSurface) -> str | None:
     if bends >= off:
         return None
     return (
-        f"Not taken as an isometric sheet: it deforms by {bends:.1%} of its size, while the pictures differ from those of a plane "
+        f"Rejected as an isometric sheet: it deforms by {bends:.1%} of its size, while the pictures differ from those of a plane "
         f"by {off:.1%}, as those of a rigid solid do."
     )
 
 
 def _some_frames(points: Floats, seen: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return the frames of the first look, from some of the points."""
+    """Return dissimilar frames for the first test, chosen with about `FIRST_LOOK` points."""
     often = np.argsort(-seen.sum(axis=0), kind="stable")[:: max(1, seen.shape[1] // FIRST_LOOK)]
     return unlike_frames(points[:, often], seen[:, often], SOLVED_FRAMES)
 
@@ -233,7 +234,7 @@ def _prepared(
     if len(edges) == 0:
         return None
     known = connected(anchors.seen, edges)
-    # The depths of fewer are open, and the lengths of all frames would follow them.
+    # Fewer anchors do not determine their depths, which would distort the lengths of all frames.
     known &= known.sum(axis=1, keepdims=True) >= FEWEST_ANCHORS
     if known.any(axis=1).sum() < 2:
         return None
@@ -242,7 +243,7 @@ def _prepared(
 
 
 def _glance(search: FocalSearch, focal: float) -> float:
-    """Return I of some anchors and frames at one focal length; infinite if there is no surface."""
+    """Return I of the subset `SMALL_PART` at one focal length; infinite if there is no surface."""
     some, frames, neighbours = SMALL_PART
     part = replace(search.anchors, points=search.anchors.points[:, :some], seen=search.seen[:, :some])
     edges = nearest_neighbours(part, neighbours=neighbours)
@@ -254,7 +255,7 @@ def _glance(search: FocalSearch, focal: float) -> float:
 
 
 def _everywhere(search: FocalSearch, tracks: Tracks, seen: NDArray[np.bool_], chosen: Tried) -> IsometricSurface | None:
-    """Return the surface of all frames and points, from the anchors of some frames at the chosen focal length."""
+    """Return the surface in all frames and points at the chosen focal length, or None if the anchors are not connected."""
     part = search.graph(chosen.focal, search.frames)
     whole = search.graph(chosen.focal)
     afresh = maximum_depth(part, should_stop=search.should_stop)
@@ -262,7 +263,7 @@ def _everywhere(search: FocalSearch, tracks: Tracks, seen: NDArray[np.bool_], ch
     found = min(found, chosen.found, key=lambda each: each.inconsistency)
     if len(search.frames) < tracks.num_frames:
         found = refine(whole, _from_similar(whole, search, found.depths), should_stop=search.should_stop)
-    if not search.stopped:  # the chord of a long edge is shorter than the surface between its ends
+    if not search.stopped:  # short edges only: the chord of a long one is shorter than the surface between its ends
         near = replace(
             whole, edges=nearest_neighbours(replace(search.anchors, seen=search.seen), neighbours=LAST_NEIGHBOURS)
         )
@@ -286,7 +287,7 @@ def _everywhere(search: FocalSearch, tracks: Tracks, seen: NDArray[np.bool_], ch
 
 
 def _from_similar(graph: SurfaceGraph, search: FocalSearch, depths: Floats) -> Floats:
-    """Return depths `(F, A)` for all frames, those of the solved frame whose image is most alike."""
+    """Return starting depths `(F, A)` of all frames, copied from the solved frame with the most similar image."""
     start = np.zeros(graph.seen.shape)
     rays, seen = graph.rays[search.frames], graph.seen[search.frames]
     for frame in range(len(start)):
@@ -312,7 +313,7 @@ def _centre(
 
 
 def _diagonal(tracks: Tracks, image_size: tuple[float, float] | None) -> float:
-    """Return the image's diagonal, or a guess from the middle 98 % of the tracks."""
+    """Return the image diagonal, estimated from the middle 98 % of the tracks if the size is not given."""
     if image_size is not None:
         return float(np.hypot(*image_size))
     low, high = np.quantile(tracks.points[tracks.visible > 0], [0.01, 0.99], axis=0)

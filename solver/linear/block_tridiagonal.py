@@ -1,13 +1,13 @@
-"""Block-tridiagonal preconditioner: the exact solution over frames for each point, with every observation's own weight.
+"""Block-tridiagonal preconditioner: the exact solution over frames for each point, with individual observation weights.
 
-Without the coupling between neighbouring points, 𝒜 restricted to one point is block tridiagonal over frames,
+Without the coupling between neighbouring points, 𝒜 is block tridiagonal over frames for each point,
 
     D_f = s²Rᵀ diag(ω_fp) R + (λ1 [HᵀH]_ff + λ2 [AᵀA]_pp) I,        off-diagonal blocks λ1 [HᵀH]_f,f+1 I,
 
 with 3×3 blocks; the diagonal of the spatial term is kept. Block elimination (Golub and Van Loan, Matrix Computations,
-4.5.1) has constant cost per frame and point and stores six numbers for each. The IRLS weights of inliers and outliers
-differ by two orders of magnitude, so one mean weight per frame, as in the cosine preconditioner, fits neither. The
-spatial coupling that is missing here is added by `pliant.solver.linear.multigrid`.
+4.5.1) has constant cost per frame and point and stores six numbers for each. IRLS weights of inliers and outliers differ
+by two orders of magnitude, so one mean weight per frame, as in the cosine preconditioner, fits neither.
+`pliant.solver.linear.multigrid` adds the spatial coupling.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from pliant.solver.threads import over_ranges
 Array = NDArray[np.floating]
 
 POINTS_PER_BLOCK = 8192
-"""Points eliminated together, so that one frame of them fits in the processor's cache. Milliseconds per application, 99 ×
-29,000, with 2,048, 4,096, 8,192 points: 59, 41, 35 in double precision; 41, 27, 20 in single."""
+"""Number of points eliminated together, so that one frame of them fits in the processor's cache. Milliseconds per
+application on 99 × 29,000 with 2,048, 4,096, 8,192 points: 59, 41, 35 in double precision; 41, 27, 20 in single."""
 
 DIAGONAL_RIDGE = 1e-9
-"""Ridge on every diagonal, relative to λ1: without it the system of a point that is never visible is singular."""
+"""Ridge on the diagonal, relative to that of the stencil; without it the system of a point that is never visible is singular."""
 
 ROUNDING = 64.0
-"""Lower bound of the ridge in units of machine epsilon: bounds the rounding error of the elimination."""
+"""Least relative ridge in units of machine epsilon; bounds the rounding error of the elimination."""
 
 SINGLE_SPAN = 1e5
-"""Maximum ratio of an observation's weight to the stiffness of a path for which single precision is used."""
+"""Ratio of the largest observation weight to the stiffness of a path below which single precision is used."""
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Row and column indices of the six distinct entries of a symmetric 3×3 block."""
@@ -62,7 +62,7 @@ def suits_single_precision(operator: Operator) -> bool:
 def build(operator: Operator, stiffness: Floats | None = None) -> Linear:
     """Factor the preconditioner for one reweighting and return r ↦ M⁻¹ r.
 
-    `stiffness` is the diagonal of the spatial term, shape `(P,)`; by default that of the operator.
+    `stiffness` is the diagonal of the spatial term, shape `(P,)`; it defaults to the operator's own.
     """
     stiffness = stiffness_of_neighbours(operator) if stiffness is None else stiffness
     kind = operator.weights.dtype
@@ -95,7 +95,7 @@ def _blocks(start: int, stop: int) -> list[tuple[int, int]]:
 
 
 def _eliminate(operator: Operator, shift: Array, coupling: Array, inverses: Array, points: slice) -> None:
-    """Fill in D̃_f⁻¹, with D̃_0 = D_0 and D̃_f = D_f − c² D̃_{f−1}⁻¹."""
+    """Fill `inverses` with D̃_f⁻¹, where D̃_0 = D_0 and D̃_f = D_f − c² D̃_{f−1}⁻¹."""
     first, second = np.array(PAIRS).T
     products = operator.projections[:, :, first] * operator.projections[:, :, second]  # (F, 2, 6)
     block, spare = np.empty_like(inverses[0]), np.empty_like(inverses[0])
@@ -121,7 +121,7 @@ def _invert(block: Array, out: Array) -> None:
 
 
 def _substitute(inverses: Array, coupling: Array, r: Array, out: Array) -> None:
-    """Forward z_f = D̃_f⁻¹ (r_f − c z_{f−1}), then back z_f −= c D̃_f⁻¹ z_{f+1}."""
+    """Substitute forward, z_f = D̃_f⁻¹ (r_f − c z_{f−1}), then backward, z_f −= c D̃_f⁻¹ z_{f+1}."""
     right, product, spare = (np.empty_like(r[0]) for _ in range(3))
     for frame in range(len(r)):
         if frame == 0:

@@ -18,7 +18,7 @@ class Linear(Protocol):
     """A linear map of arrays."""
 
     def __call__(self, x: Array, /, out: Array | None = None) -> Array:
-        """Return the image of x, in `out` if it is given and the map can use it."""
+        """Return the image of x, written to `out` if it is given and the map supports it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,7 +28,7 @@ class Solved:
     x: Array
     iterations: int
     relative: float
-    """Final over initial preconditioned residual norm √(rᵀM⁻¹r)."""
+    """Ratio of the final to the initial preconditioned residual norm √(rᵀM⁻¹r)."""
     decrease: float = 0.0
     """Decrease of xᵀ𝒜x − 2bᵀx."""
 
@@ -46,19 +46,19 @@ def conjugate_gradient(
 ) -> Solved:
     """Solve 𝒜 x = b, starting from 0, for a symmetric positive (semi)definite 𝒜.
 
-    Every iteration decreases ½ xᵀ𝒜x − bᵀx, so majorise–minimise descends even when the inner solve is stopped early.
-    Stops when √(rᵀM⁻¹r) has fallen to `reduction` times its initial value, or to rounding level relative to √(bᵀM⁻¹b),
-    or when rᵀM⁻¹r, about what is left to gain of xᵀ𝒜x − 2bᵀx, is at most `negligible`. `should_stop` is called at the start and in every
-    iteration; once it returns True in an iteration, x so far is returned.
-    Saad, Iterative Methods for Sparse Linear Systems (2003), algorithm 9.1.
+    Saad, Iterative Methods for Sparse Linear Systems (2003), algorithm 9.1. Every iteration decreases ½ xᵀ𝒜x − bᵀx, so
+    majorise–minimise descends even if the inner solve stops early. Iterations end when √(rᵀM⁻¹r) has fallen to
+    `reduction` times its initial value or to rounding level, or when rᵀM⁻¹r, an estimate of the remaining decrease of
+    xᵀ𝒜x − 2bᵀx, is at most `negligible`. `should_stop` is called at the start, where its result is ignored, and in every
+    iteration; once it returns True there, the current x is returned.
 
-    Four arrays of the size of x are allocated once and reused; allocating them in every iteration would cost more in
-    page faults than in arithmetic. With `overwrite_b` b itself becomes one of them. 𝒜 times the direction and the
-    preconditioned residual are never needed at once, so they share one.
+    Four arrays of the size of x are allocated once and reused, because page faults of new arrays in every iteration would
+    cost more than the arithmetic. With `overwrite_b`, b is one of them. 𝒜 times the direction and the preconditioned
+    residual share an array, as they are never needed at the same time.
     """
     x, residual, spare = np.zeros_like(b), b if overwrite_b else b.copy(), np.empty_like(b)
     if should_stop is not None:
-        should_stop()  # for its progress: first touching gigabytes of memory takes as long as an iteration
+        should_stop()  # to report progress: first touching gigabytes of memory takes as long as an iteration
     z = precondition(residual, out=spare)
     pulse()
     direction = np.empty_like(b)
@@ -109,7 +109,7 @@ def _turn(factor: float, z: Array, direction: Array) -> None:
 
 
 def dot(one: Array, two: Array) -> float:
-    """Inner product, computed slice by slice and summed in double precision, as float32 requires.
+    """Return the inner product, computed per slice and summed in double precision, as single-precision arrays require.
 
     BLAS is avoided: its threads synchronise by busy waiting, which on a loaded machine takes longer than the sum.
     """

@@ -1,13 +1,13 @@
 """Coarse-space correction for points whose weights differ from the mean of their frame: few modes, individual weights.
 
-A preconditioner with one weight per frame treats all points as equally visible. A hidden or down-weighted point is
-determined by the prior only, and the Gaussian prior is weak along modes of large variance. Along these the mean weights
-are wrong by orders of magnitude, which slows conjugate gradients down. Such modes are few, so on their span U (F×m per
-coordinate) the equations are solved exactly for each point,
+A preconditioner with one weight per frame treats all points as equally visible. Only the prior determines a hidden or
+down-weighted point, and the Gaussian prior is weak along modes of large variance. Along these modes the mean weights are
+wrong by orders of magnitude, which slows down conjugate gradients. There are only a few such modes, so on their span U
+(F×m per coordinate) the equations are solved exactly for each point,
 
     N_p = Σ_fi ω_fip u_fi u_fiᵀ + λ1 UᵀQU,    u_fi = U_fᵀ R_fiᵀ,
 
-and the result is added to that of the mean weights.
+and the solution is added to that with mean weights.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pliant.solver.threads import over_ranges
 Array = NDArray[np.floating]
 
 MAX_FREE_MODES = 12
-"""Maximum number of modes per coordinate; memory grows with its square."""
+"""Maximum number of modes per coordinate; memory is quadratic in it."""
 
 HELD = 0.05
 """Ratio of the prior's precision to the mean weight below which a mode belongs to the coarse space."""
@@ -37,16 +37,16 @@ ENOUGH = 0.002
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coarse:
-    """U and N⁻¹."""
+    """Coarse space U and the inverses N_p⁻¹."""
 
     modes: tuple[Floats, Floats, Floats]
-    """U of every coordinate, shape `(F, m_c)` each."""
+    """U of each coordinate c, shape `(F, m_c)`."""
 
     points: NDArray[np.intp]
-    """The points with deviating weights, shape `(D,)`."""
+    """Indices of the points with deviating weights, shape `(D,)`."""
 
     inverses: Array
-    """N_p⁻¹ of these, shape `(D, m, m)`, m the sum of all m_c."""
+    """N_p⁻¹ of these points, shape `(D, m, m)` with m = Σ m_c."""
 
     def add(self, r: Array, out: Array) -> None:
         """Add U N⁻¹ Uᵀ r to `out`, both of shape `(F, 3, P)`."""
@@ -101,11 +101,11 @@ def build_coarse(operator: Operator, stiffness: Floats) -> Coarse | None:
 
 
 MODE_BLOCK = 256
-"""Points inverted together."""
+"""Number of points inverted together."""
 
 
 def _free_modes(operator: Operator, limit: float) -> tuple[tuple[Floats, Floats, Floats], list[Floats]]:
-    """Return, for each coordinate, the modes of least prior precision and their precision."""
+    """Return, for each coordinate, the modes with a prior precision below `limit` and their precisions."""
     assert operator.quadratic is not None
     modes, held = [], []
     for directions, values in operator.quadratic.loosest(MAX_FREE_MODES):
@@ -116,6 +116,6 @@ def _free_modes(operator: Operator, limit: float) -> tuple[tuple[Floats, Floats,
 
 
 def _seen(operator: Operator, modes: tuple[Floats, Floats, Floats]) -> Floats:
-    """Return u, the modes projected to the image, shape `(F, 2, m)`."""
+    """Return u_fi, the modes projected to the image, shape `(F, 2, m)`."""
     cameras = operator.projections.astype(np.float64)
     return np.concatenate([cameras[:, :, c, None] * modes[c][:, None, :] for c in range(3)], axis=2)

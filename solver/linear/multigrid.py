@@ -1,4 +1,4 @@
-"""Additive multilevel preconditioner: the inverse for single points (`linear.points`) on the points and on every coarser level."""
+"""Additive multilevel preconditioner: the point-wise inverse (`linear.points`) on the finest and every coarser level."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def build(operator: Operator) -> Linear:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coarser:
-    """A coarse level and the inverse of its blocks."""
+    """A coarse level and its point-wise inverse."""
 
     level: Level
     inverse: Linear

@@ -1,9 +1,9 @@
-"""Preconditioner of one level of a mesh: every point on its own, with the diagonal of the spatial term.
+"""Point-wise preconditioner of one level of a mesh: each point separately, with the diagonal of the spatial term.
 
 The equations over frames are inverted for each point (`linear.block_tridiagonal`); the modes of a Gaussian prior are
-added (`linear.woodbury`), and corrected where weights differ (`linear.deflation`). All three include the spatial term's
-diagonal: motion of single points along a mode costs little in the prior, but much bending. On 99 × 3,500 points of a
-face, conjugate gradients need 9 iterations instead of 36 for the same energy.
+added (`linear.woodbury`), and corrected for points with other weights (`linear.deflation`). All three include the
+diagonal of the spatial term, because moving a single point along a mode costs little in the prior but much in bending.
+On 99 × 3,500 points of a face, conjugate gradients then need 9 iterations instead of 36 for the same energy.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = NDArray[np.floating]
 def build(operator: Operator, stiffness: Floats | None = None) -> Linear:
     """Factor for one reweighting and return r ↦ M⁻¹ r.
 
-    `stiffness` is the diagonal of the spatial term, shape `(P,)`; by default that of the operator.
+    `stiffness` is the diagonal of the spatial term, shape `(P,)`; it defaults to the operator's own.
     """
     stiffness = block_tridiagonal.stiffness_of_neighbours(operator) if stiffness is None else stiffness
     paths = block_tridiagonal.build(operator, stiffness)

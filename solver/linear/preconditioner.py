@@ -1,10 +1,10 @@
-"""Choice of the preconditioner; its cost is linear in frames and points, like that of the equations.
+"""Choice of the preconditioner.
 
-If each frame is coupled to its neighbours only, the equations over frames are inverted for each point
-(`linear.points`), and coarser levels are added where the spatial term matters (`linear.multigrid`). Otherwise (a rank
-term, second differences or no temporal smoothness) each frame gets one mean weight. 𝒜 then is the Sylvester operator
-X ↦ T X + λ2 X K with T the 3F×3F temporal part, diagonalised once per reweighting, and K = AᵀA over points, nearly
-diagonal in the cosine basis of a grid.
+If frames are coupled to their neighbours only, the equations over frames are inverted for each point (`linear.points`),
+and coarser levels are added if the spatial term matters (`linear.multigrid`); the cost is linear in frames and points.
+Otherwise (rank term, second differences or no temporal smoothness) each frame gets one mean weight. 𝒜 then is the
+Sylvester operator X ↦ T X + λ2 X K, with T the 3F×3F temporal part, diagonalised once per reweighting, and K = AᵀA over
+points, nearly diagonal in the cosine basis of a grid.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ Array = NDArray[np.floating]
 MIN_POINTS_PER_THREAD = 1024
 """Minimum number of points per thread."""
 BENDS = 1.0
-"""Ratio of the spatial term to the smallest eigenvalue of the temporal term above which coarser levels are added."""
+"""Ratio of the spatial term to the temporal stiffness of slow motion above which coarser levels are added."""
 
 
 def temporal_matrix(operator: Operator) -> Floats:
-    """Return T, dense `(3F, 3F)`: data term with each frame's mean weights, stencil over frames, rank term."""
+    """Return T, dense `(3F, 3F)`: data term with mean weights per frame, stencil and modes over frames, rank term."""
     frames = len(operator.projections)
     cameras = operator.projections.astype(np.float64)
     mean = operator.weights.mean(axis=2, dtype=np.float64)
@@ -51,7 +51,7 @@ def temporal_matrix(operator: Operator) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Diagonalised:
-    """T = V diag(values) Vᵀ."""
+    """Eigendecomposition T = V diag(values) Vᵀ."""
 
     vectors: Array
     values: Floats
@@ -68,14 +68,14 @@ def build_preconditioner(operator: Operator) -> Linear:
     if not block_tridiagonal.fits(operator):
         return _alike(operator)
     build = multigrid.build if bends(operator) else points.build
-    # Without a Gaussian prior some directions are not held; the larger ridge of single precision would hold them.
+    # Without a Gaussian prior some directions are unconstrained; the larger ridge of single precision would constrain them.
     if operator.quadratic is None or not block_tridiagonal.suits_single_precision(operator):
         return build(operator)
     return _in_single_precision(build(operator.rounded(np.dtype(np.float32))))
 
 
 def _in_single_precision(inverse: Linear) -> Linear:
-    """Return the inverse for residuals of any precision: a preconditioner needs few digits, and half the memory traffic."""
+    """Wrap a single-precision inverse for residuals of any precision: few digits suffice, at half the memory traffic."""
     spare: list[Array] = []  # allocated once: touching new memory takes as long as the conversion
 
     def apply(r: Array, /, out: Array | None = None) -> Array:
@@ -94,7 +94,7 @@ def _in_single_precision(inverse: Linear) -> Linear:
 
 
 def bends(operator: Operator) -> bool:
-    """Whether the spatial term matters beside the temporal stiffness of slow motion, which is λ1/F²."""
+    """Whether the spatial term matters compared with the temporal stiffness of slow motion, about λ1/F²."""
     if operator.laplacian is None or operator.spatial_weight == 0:
         return False
     slow = float(operator.stencil[0].max()) / len(operator.projections) ** 2
@@ -102,7 +102,7 @@ def bends(operator: Operator) -> bool:
 
 
 def _alike(operator: Operator) -> Linear:
-    """Return the inverse for one weight per frame."""
+    """Return the inverse with one mean weight per frame."""
     kind = operator.weights.dtype
     laplacian = operator.laplacian
     if laplacian is None or operator.spatial_weight == 0:
@@ -117,7 +117,7 @@ def _alike(operator: Operator) -> Linear:
 
 
 def _by_inverse(temporal: Floats, kind: np.dtype[np.floating]) -> Linear:
-    """Return the solution of T x_p = r_p for every point p by one product with T⁻¹."""
+    """Return r ↦ T⁻¹ r for every point, by one product with a dense T⁻¹."""
     size = len(temporal)
     temporal[np.diag_indices(size)] += 1e-12 * temporal.diagonal().max()
     inverse = linalg.cho_solve(linalg.cho_factor(temporal, lower=True), np.eye(size))
@@ -152,7 +152,7 @@ def _by_point(r: Array, temporal: Diagonalised, shift: Floats) -> Array:
 
 
 def _by_cosines(r: Array, temporal: Diagonalised, grid: Ints, weight: float) -> Array:
-    """Solve T X + λ2 X K = R on the bounding grid with reflecting borders, K diagonal in cosines."""
+    """Solve T X + λ2 X K = R on the bounding grid with reflecting borders, where cosines diagonalise K."""
     height, width = grid.shape
     filled = grid >= 0
     inner = temporal.vectors.T @ r.reshape(len(temporal.values), -1)
@@ -167,7 +167,7 @@ def _by_cosines(r: Array, temporal: Diagonalised, grid: Ints, weight: float) -> 
 
 
 def stencil_symbol(height: int, width: int) -> Floats:
-    """Eigenvalues of the 8-direction stencil with reflecting borders, shape `(height, width)`, ≤ 0."""
+    """Return the eigenvalues, all ≤ 0, of the 8-neighbour stencil with reflecting borders, shape `(height, width)`."""
     down = np.cos(np.pi * np.arange(height) / height)[:, None]
     right = np.cos(np.pi * np.arange(width) / width)[None, :]
     symbol: Floats = 2 * down + 2 * right + 4 * down * right - 8

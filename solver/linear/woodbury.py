@@ -1,9 +1,9 @@
 """The modes of the Gaussian prior in the preconditioner, with one weight per frame.
 
-Block elimination (`linear.block_tridiagonal`) inverts N, the part that couples neighbouring frames, with every
-observation's own weight. The modes are added by Woodbury's identity, (N − V Vᵀ)⁻¹ = N⁻¹ + N⁻¹V (I − VᵀN⁻¹V)⁻¹ VᵀN⁻¹.
-With the mean weight of each frame, the second term is one matrix Z Zᵀ for all points; `linear.deflation` corrects it
-where weights differ. The cost is linear in the frames and quadratic in the modes.
+Block elimination (`linear.block_tridiagonal`) inverts N, the block-tridiagonal part, with individual observation weights.
+Woodbury's identity adds the modes: (N − V Vᵀ)⁻¹ = N⁻¹ + N⁻¹V (I − VᵀN⁻¹V)⁻¹ VᵀN⁻¹. With the mean weight of each frame,
+the second term is one matrix Z Zᵀ for all points; `linear.deflation` corrects it for points with other weights. The cost
+is linear in the number of frames and quadratic in the number of modes.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from pliant.solver.operators.normal_equations import Operator
 Array = NDArray[np.floating]
 
 LEAST = 1e-12
-"""Floor of the eigenvalues of I − VᵀN⁻¹V, about the ratio of the noise to the variance of an unobserved mode."""
+"""Floor of the eigenvalues of I − VᵀN⁻¹V; about the ratio of noise to the variance of an unobserved mode."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeanModes:
-    """Z, shape `(3F, k)`."""
+    """The factor Z, shape `(3F, k)`."""
 
     along: Array
 
     @classmethod
     def of(cls, operator: Operator, stiffness: float = 0.0) -> MeanModes:
-        """Compute Z for an operator with a Gaussian prior, and one diagonal of the spatial term for all points."""
+        """Compute Z for an operator with a Gaussian prior; `stiffness` is the mean diagonal of the spatial term."""
         assert operator.quadratic is not None
         frames, sizes = len(operator.projections), [each.shape[1] for each in operator.quadratic.modes]
         cuts = np.cumsum([0, *sizes])

@@ -7,9 +7,9 @@ with unknown variance; at the most likely variance the negative log likelihood i
 
     3/2 log(floor² + mean_f ½‖T_f − T_{f−1}‖_F²)
 
-for each of the F − 2 changes, divided by F as the energy is. The term for the scales is ½ log(floor² + mean_f (log
-s_{f+1} − log s_f)²). The variance is estimated, so there is no strength to tune: the prior is weak for a jerky camera
-and strong for a smooth one. Below the floors, smoother motion is no longer rewarded.
+for each of the F − 2 changes, divided by F like the energy. The term for the scales is ½ log(floor² + mean_f (log
+s_{f+1} − log s_f)²). The variance is estimated, not tuned: the prior is weak for a jerky camera and strong
+for a smooth one. Below the floors, smoother motion is no longer rewarded.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SCALE_FLOOR = 0.002
 """Floor of the change of log s between frames: smaller changes are not rewarded."""
 
 STEADY = 0.5 * float(np.log(SCALE_FLOOR**2))
-"""The penalty on scales that are all equal: it counts where scales are fixed, so that energies with fixed and free ones compare."""
+"""Penalty on equal scales, added if scales are fixed so that energies with fixed and free scales are comparable."""
 
 
 def rotation_roughness(rotations: Floats) -> tuple[float, Floats]:

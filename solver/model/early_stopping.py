@@ -3,10 +3,10 @@
 With fewer points than image coordinates, P < 2F, the Gram matrix of the tracks is rank deficient and the likelihood
 is unbounded: it keeps growing as the covariance concentrates on the given points. Expectation maximisation learns
 common structure first, and idiosyncrasies of single points and of the depth of single frames last. The points are
-therefore split into three folds. Each fold in turn is held out and scored after every round of EM on the other two;
-all points are then learned from for the number of rounds with the lowest held-out negative log likelihood.
+therefore split into three folds. Each fold in turn is held out and scored after every round of EM on the other two. EM on
+all points then runs for the number of rounds with the lowest held-out negative log likelihood.
 
-Where the motion has few modes, the held-out likelihood improves to the end and nothing is stopped.
+If the motion has few modes, the held-out likelihood improves to the end and EM is not stopped early.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ def learn_with_early_stopping(
     seed: int = 0,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[ShapeCovariance, str]:
-    """Return the covariance learned from scratch for the number of rounds that suits held-out points, and a sentence.
+    """Return the covariance learned from scratch in the number of rounds that held-out points favour, and a sentence.
 
     Parameters
     ----------
     sample : array, shape (F, S, 2)
-        Some points of centred, complete tracks, normalized units; held out only if they are all points and fewer than 2F.
+        Sampled points of centred, complete tracks, normalized units; held out only if they are all points and fewer than 2F.
     gram, projections
         As for `pliant.solver.model.expectation_maximisation.learned`.
     model_order : ModelOrder
@@ -80,7 +80,9 @@ def learn_with_early_stopping(
         ordered=model_order.ordered,
         should_stop=should_stop,
     )
-    reason = f"more than {model_order.max_modes} modes, learned from some points, do not make the others more probable."
+    reason = (
+        f"more than {model_order.max_modes} modes, learned from some points, do not make other points more probable."
+    )
     return covariance, described(covariance, reason if model_order.max_modes < MAX_MODES else "")
 
 
@@ -119,7 +121,7 @@ def _stopped_early(
 
 
 def described(covariance: ShapeCovariance, more: str = "") -> str:
-    """Return a sentence that states the number of modes and the noise."""
+    """Return a sentence with the number of modes and the noise."""
     found = f"{covariance.modes.shape[1]} modes of deformation, noise of {covariance.noise_variance**0.5:.2g} RMS radii"
     return f"{found}; {more}" if more else f"{found}."
 

@@ -1,9 +1,8 @@
 """The shape covariance (`model.shape_covariance`), learned by expectation maximisation from tracks and their cameras.
 
-As in probabilistic PCA with missing data: Torresani,
-Hertzmann, Bregler (2008), "Nonrigid structure-from-motion: estimating shape and motion with hierarchical priors".
-Here frames instead of points are the variables, so that all statistics are in the 2F×2F Gram matrix W Wᵀ / P and the
-cost does not depend on P.
+This is probabilistic PCA with missing data, as in Torresani, Hertzmann, Bregler (2008), "Nonrigid structure-from-motion:
+estimating shape and motion with hierarchical priors". Here the variables are frames instead of points, so that all
+statistics are in the 2F×2F Gram matrix W Wᵀ / P and the cost does not depend on P.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from pliant.solver.tracks.noise import roughness
 from scipy.linalg import lapack
 
 MAX_ITERATIONS, MIN_ITERATIONS, ITERATION_FRAMES = 150, 60, 18_000
-"""EM rounds from scratch: min(MAX_ITERATIONS, max(MIN_ITERATIONS, ITERATION_FRAMES // F)), since a round costs F³.
+"""EM rounds from scratch: min(MAX_ITERATIONS, max(MIN_ITERATIONS, ITERATION_FRAMES // F)), since a dense round costs F³.
 Horse of 48 frames, known cameras: error .020 after 60 rounds, .013 after 150, no lower after 400."""
 
 MAX_MODES = 64
@@ -52,7 +51,7 @@ MAX_DENSE_FRAMES = 160
 """Maximum number of frames for which an EM round works on dense 2F×2F matrices, which is then the faster form."""
 
 GUARD_VECTORS = 8
-"""Eigenvectors beyond the modes that are carried from round to round, in which new modes appear."""
+"""Eigenvectors beyond the modes that are carried from round to round, from which new modes emerge."""
 
 
 def learned(
@@ -68,7 +67,7 @@ def learned(
     """Return the more probable of two covariances learned by EM from scratch.
 
     The first run is annealed, then continued without annealing with the mean position added as a mode, which undoes a
-    rotation that annealing took for deformation. The second run is never annealed. Neither is better on all data, so
+    rotation that annealing mistook for deformation. The second run is never annealed. Neither is better on all data, so
     the likelihood decides.
 
     Parameters
@@ -156,7 +155,7 @@ def begin(
     max_modes: int = MAX_MODES,
     ordered: bool = True,
 ) -> ShapeCovariance:
-    """Return a starting covariance: that of the least-squares shapes with least acceleration; if unordered, with least deformation.
+    """Return the starting covariance of least-squares shapes with least change between frames; if unordered, with least deformation.
 
     Parameters
     ----------
@@ -216,7 +215,7 @@ def rounds(
 ) -> Iterator[ShapeCovariance]:
     """Yield the covariance after every round of EM, each with its floor of τ.
 
-    With V = ΠΣΠᵀ + σ²I and K = V⁻¹(G − V)V⁻¹ every second moment of the posterior is a contraction of K: for a
+    With V = ΠΣΠᵀ + σ²I and K = V⁻¹(G − V)V⁻¹, every second moment of the posterior is a contraction of K: for a
     component with covariance D and image ΠD, E[xxᵀ] = D + (ΠD)ᵀ K (ΠD). Modes and walk variance are the probabilistic
     principal components (Tipping, Bishop 1999) of C relative to the random walk. `MAX_DENSE_FRAMES` selects the dense
     or the factored form of K.
@@ -275,7 +274,7 @@ def _linear_round(
 
     All contractions except those for the modes are derivatives of `image_density`. With root rootᵀ = T⁻¹ and C̃ =
     rootᵀ C root, the modes are the leading eigenvectors of C̃ + C̃ m C̃/3, of which only products and the trace are
-    needed: one Nyström step a round, from the eigenvectors of the previous round and `GUARD_VECTORS` more.
+    needed: one Nyström step per round, from the eigenvectors of the previous round and `GUARD_VECTORS` more.
     """
     frames, count = covariance.modes.shape
     root0, root1 = root_matrix(covariance.mean_covariance), root_matrix(covariance.axis_covariance)
@@ -294,7 +293,7 @@ def _linear_round(
     total = float((along**2).sum()) + frames * covariance.walk_variance
     total += (float((square * inner).sum()) + covariance.walk_variance * float((walk * by_walk).sum())) / 3
     begun = np.hstack([along, _cosines(frames, max_modes)]) if subspace is None else subspace
-    if begun.shape[1] == 0:  # neither modes nor permission for any: the walk alone improves
+    if begun.shape[1] == 0:  # no modes exist and none are allowed: only the walk is improved
         begun = _cosines(frames, 1)
     values, vectors = _nystrom(_mode_operator(covariance, along, walk, seen), begun)
     modes, walk_variance = _kept(values, vectors, total, floor, min(max_modes, frames - 1))
@@ -311,10 +310,10 @@ def _linear_round(
 def _mode_operator(
     covariance: ShapeCovariance, along: Floats, walk: Floats, seen: Explained
 ) -> Callable[[Floats], Floats]:
-    """Return the product of C̃ + C̃ m C̃/3 with columns of vectors; `along` are the whitened modes, `walk` the images of the random walk."""
+    """Return a function that applies C̃ + C̃ m C̃/3 to columns; `along` are the whitened modes, `walk` the images of the random walk."""
     frames, ordered = len(along), covariance.ordered
 
-    def spread(vectors: Floats) -> Floats:  # C̃ times them
+    def spread(vectors: Floats) -> Floats:  # C̃ times vectors
         result: Floats = along @ (along.T @ vectors) + covariance.walk_variance * vectors
         return result
 
@@ -387,7 +386,7 @@ def _split(over_frames: Floats, floor: float, max_modes: int, *, ordered: bool) 
     values, vectors = np.linalg.eigh(_symmetric(root.T @ over_frames @ root))
     values, vectors = values[::-1], vectors[:, ::-1]
     max_modes = min(max_modes, frames - 1)
-    # The sum takes a third of the time of `mean`, which shows in short films: this runs thousands of times.
+    # `sum` takes a third of the time of `mean`, which matters for short films: this runs thousands of times.
     walk_variance = max(float(values[max_modes:].sum() / (frames - max_modes)), floor)
     count = min(max_modes, int((values > MODE_VARIANCE_RATIO * walk_variance).sum()))
     walk_variance = max(float(values[count:].sum() / (frames - count)), floor)

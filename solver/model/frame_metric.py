@@ -2,7 +2,7 @@
 
 With V the covariance of a point's images (`model.image_density`), the expected second derivative of the negative log-likelihood for a
 change dQ of columns that explain much of V is tr dQᵀV⁻¹dQ: a change over time that the modes or the random walk explain costs little, one
-that they do not explain costs 1/σ², a million times as much. Quasi-Newton steps in the parameters themselves therefore creep. In
+that they do not explain costs 1/σ², a million times as much. Quasi-Newton steps in the parameters themselves are therefore slow. In
 coordinates z with x = R z over the frames, R Rᵀ = σ²I + τT + L Lᵀ, the cost is about 1 for all: natural coordinates in the sense of
 Amari (1998), "Natural gradient works efficiently in learning", with the metric of the start.
 
@@ -21,19 +21,19 @@ from scipy.fft import dct, idct
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameMetric:
-    """R, as spectrum times identity plus low rank."""
+    """R in factored form: spectrum times identity plus low rank."""
 
     spectrum: Floats
     """Standard deviations of σ²I + τT in its eigenvectors, shape `(F, 1)`."""
 
     vectors: Floats
-    """Orthonormal vectors in which L Lᵀ adds to it, relative to the spectrum, shape `(F, k)`."""
+    """Orthonormal directions of L Lᵀ, in the eigenvectors of T and relative to the spectrum, shape `(F, k)`."""
 
     gains: Floats
-    """Standard deviations there, relative to the spectrum, at least 1, shape `(k, 1)`."""
+    """Standard deviations along `vectors`, relative to the spectrum, at least 1, shape `(k, 1)`."""
 
     ordered: bool
-    """Whether eigenvectors of T are cosines over the frames, or T is the identity."""
+    """True if T is a random walk, whose eigenvectors are cosines over the frames; False if T is the identity."""
 
     @classmethod
     def of(cls, modes: Floats, *, noise_variance: float, walk_variance: float, ordered: bool) -> FrameMetric:
@@ -59,7 +59,7 @@ class FrameMetric:
         return self._stretched(self._eigen(parameters) / self.spectrum, 1 / self.gains)
 
     def gradient(self, by_parameters: Floats) -> Floats:
-        """Return Rᵀ g, the gradient by coordinates, shape `(F, n)`."""
+        """Return Rᵀ g, the gradient with respect to the coordinates, shape `(F, n)`."""
         return self._stretched(self._eigen(by_parameters) * self.spectrum, self.gains)
 
     def _eigen(self, values: Floats) -> Floats:

@@ -102,7 +102,7 @@ def begin(scene: Scene, scales: Floats, covariance: ShapeCovariance) -> Basis:
     return Basis(np.zeros((frames, 3)), np.log(scales), weights, root, 0.5 * np.log([noise, covariance.walk_variance]))
 
 
-# A line search may try a step far too long: that energy is `UNLIKELY`.
+# A line search may try a step that overflows: its energy is then `UNLIKELY`.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def energy(scene: Scene, axis_covariance: Floats, basis: Basis) -> tuple[float, Basis]:
     """Return the energy with the camera-motion prior, and its gradient, analytic in every parameter.
@@ -110,11 +110,11 @@ def energy(scene: Scene, axis_covariance: Floats, basis: Basis) -> tuple[float, 
     Parameters
     ----------
     scene : Scene
-        Its smoothness does not count.
+        Its `smoothness` is ignored.
     axis_covariance : array, shape (3, 3)
         A₁ of the random walk.
     basis : Basis
-        Where.
+        Parameters at which the energy is evaluated.
     """
     frames, size = basis.weights.shape
     rotations, scales, jacobian = cameras_and_jacobian(scene, basis)

@@ -1,4 +1,4 @@
-"""The Gaussian density of a point's images over all frames, with what is unknown about the point integrated out.
+"""The Gaussian density of a point's images over all frames, with its 3-D positions integrated out.
 
 The image positions of one point, w ∈ R^{2F}, are N(0, V) with
 
@@ -6,16 +6,16 @@ The image positions of one point, w ∈ R^{2F}, are N(0, V) with
 
 Q (2F×q) the images of a few columns (mean position, modes), B = blockdiag(B_f) those of a random walk (`model.random_walk`). With the Gram
 matrix G = W Wᵀ / P of all points the negative log-likelihood of one point and frame is E = (log det V + tr V⁻¹G) / 2F, up to a constant,
-and everything that fits cameras, modes and variances follows from Δ = ∂E/∂V = (V⁻¹ − V⁻¹GV⁻¹)/2F:
+and all derivatives for cameras, modes and variances follow from Δ = ∂E/∂V = (V⁻¹ − V⁻¹GV⁻¹)/2F:
 
     ∂E/∂Q = 2ΔQ,    ∂E/∂B_f = 2τ [Δ B (T ⊗ I₃)]_ff,    ∂E/∂σ² = tr Δ,    ∂E/∂τ = tr Δ B (T ⊗ I₃) Bᵀ.
 
-Two forms, equal to rounding. `dense_terms` factors V: (2F)³. `woodbury_terms` never forms a 2F×2F matrix: with D = V − QQᵀ, linear in F,
+Two forms agree to rounding. `dense_terms` factors V: (2F)³. `woodbury_terms` never forms a 2F×2F matrix: with D = V − QQᵀ, linear in F,
 C = I + QᵀD⁻¹Q and any F₀ with G = F₀F₀ᵀ, M = C⁻¹QᵀD⁻¹F₀ is what the columns explain, Y = D⁻¹(F₀ − QM) = V⁻¹F₀, and
 
     tr V⁻¹G = tr (F₀ − QM)ᵀY + ‖M‖²,    V⁻¹Q = D⁻¹Q C⁻¹,    QᵀY = M:
 
-residuals instead of differences of large numbers, so that a small σ costs no digits. `terms` takes the form that is faster.
+residuals instead of differences of large numbers, so that a small σ costs no digits. `terms` selects the faster form.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from scipy import linalg
 from scipy.linalg import lapack
 
 DENSE_ROWS = 210
-"""2F up to which V is factored whatever q: the other form is not faster there."""
+"""Maximum 2F for which V is always factored: the other form is not faster there."""
 
 DENSE_SHARE = 0.55
-"""Share of q and of the columns of F₀, together, in 2F above which factoring V is faster: measured for 2F = 240 … 714."""
+"""Ratio of q plus the columns of F₀ to 2F above which factoring V is faster: measured for 2F = 240 … 714."""
 
 MIN_DENSE_RANK = 2.0
-"""Pivots of G below this many roundings of its largest entry are rounding."""
+"""Pivots of G up to this multiple of the rounding error of its largest entry count as 0."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageModel:
-    """V by its parts."""
+    """V in factored form."""
 
     columns: Floats
     """Q, shape `(2F, q)`."""
@@ -56,7 +56,7 @@ class ImageModel:
     """τ."""
 
     ordered: bool = True
-    """Whether T is a random walk over frames, or the identity."""
+    """Whether T is a random walk over frames; otherwise it is the identity."""
 
     def covariance(self) -> Floats:
         """Return V, shape `(2F, 2F)`."""
@@ -86,7 +86,7 @@ class Terms:
 
 
 def factor_of(gram: Floats) -> Floats:
-    """Return F₀ with F₀F₀ᵀ = G to rounding, as many columns as G has rank: a pivoted Cholesky factor."""
+    """Return F₀ with F₀F₀ᵀ = G to rounding and rank(G) columns: a pivoted Cholesky factor."""
     size, largest = len(gram), float(np.diag(gram).max(initial=0.0))
     factor, pivots, rank, _ = lapack.dpstrf(
         gram, lower=1, tol=MIN_DENSE_RANK * float(np.finfo(np.float64).eps) * largest
@@ -113,7 +113,7 @@ def terms(model: ImageModel, factor: Floats) -> Terms:
 
 
 def dense_terms(model: ImageModel, factor: Floats) -> Terms:
-    """Return the same by a Cholesky factor of V."""
+    """Return E and its derivatives by a Cholesky factor of V."""
     frames = len(model.walk)
     inverse, log_det = inverted(model.covariance())
     explained = inverse @ factor
@@ -128,13 +128,13 @@ def dense_terms(model: ImageModel, factor: Floats) -> Terms:
 
 
 def woodbury_terms(model: ImageModel, factor: Floats) -> Terms:
-    """Return the same by Woodbury's identity, linear in the frames."""
+    """Return E and its derivatives by Woodbury's identity, in time linear in the frames."""
     return Explained.of(model, factor).terms()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Explained:
-    """What the columns and the walk explain of tracks F₀."""
+    """Tracks F₀, explained by the columns and the walk."""
 
     model: ImageModel
     walk: WalkPosterior
@@ -155,7 +155,7 @@ class Explained:
     """Y = V⁻¹F₀, shape `(2F, r)`."""
 
     strayed: Floats
-    """The walk's mean given F₀, shape `(F, 3, r)`."""
+    """Posterior mean of the walk given F₀, shape `(F, 3, r)`."""
 
     value: float
     """E."""
@@ -178,7 +178,7 @@ class Explained:
         means = linalg.cho_solve((root, True), solved.T @ factor, check_finite=False)
         rest = factor - columns @ means
         left, strayed = _solved(walk, model, rest)
-        slip = linalg.cho_solve((root, True), columns.T @ left - means, check_finite=False)  # what rounding left of M
+        slip = linalg.cho_solve((root, True), columns.T @ left - means, check_finite=False)  # rounding error of M
         means, rest = means + slip, rest - columns @ slip
         left, strayed = left - solved @ slip, strayed - walked @ slip
         log_det = 2 * frames * float(np.log(noise)) + walk.log_det + 2 * float(np.log(np.diag(root)).sum())
@@ -231,7 +231,7 @@ def inverted(matrix: Floats) -> tuple[Floats, float]:
     Raises
     ------
     numpy.linalg.LinAlgError
-        Rounding left it indefinite, or it is not finite.
+        It is indefinite to rounding, or not finite.
     """
     factor, failed = lapack.dpotrf(matrix, lower=1)
     log_det = np.inf if failed else 2 * float(np.log(np.diag(factor)).sum())

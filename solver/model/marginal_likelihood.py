@@ -10,11 +10,11 @@ and with G = W Wᵀ / P the negative log likelihood per point and frame is, up t
     E = (log det M + tr M⁻¹ G) / 2F.
 
 The trace is variable projection: tr M⁻¹ G is the minimum over S of ‖W − Π S‖²/σ² + ‖S‖²_prior. On its own it falls
-when depth is traded for rotation, because a flatter shape that turns further moves the same in the image. The
+when depth is traded for rotation, because a flatter shape that rotates more moves the same way in the image. The
 log-determinant counteracts this: a prior with less depth explains less. T is the covariance of a random walk; the
 modes L (F×q) are the low-rank part. The penalty κ‖H L‖²/2F keeps them smooth, because otherwise every frame is
-rotated to fit the mean shape. `model.camera_motion_prior` adds the penalty on the cameras. All matrices are 2F×2F;
-the cost does not depend on P.
+rotated to fit the mean shape. `model.camera_motion_prior` adds the penalty on the cameras. The tracks enter only
+through G, so the cost does not depend on P.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ NOISE_STD_FLOOR = 3e-3
 modes on model error and slows L-BFGS."""
 
 CAMERA_PRIOR_WEIGHT = 0.05
-"""Weight of `model.camera_motion_prior`, a term per camera, against E, a term per point: points of a surface move
-together and count as about 1/0.05 independent ones."""
+"""Weight of `model.camera_motion_prior`, one term per camera, relative to E, one term per point: points of a surface
+move together and count as about 1/0.05 independent ones."""
 
 SMOOTHNESS = 1000.0
 """κ, weight of the penalty on differences of the modes between frames."""
@@ -103,22 +103,22 @@ class Scene:
     """The cameras at zero turn, shape `(F, 3, 3)`."""
 
     with_scales: bool
-    """False: every s_f is 1."""
+    """Whether scales are free; otherwise every s_f is 1."""
 
     prior_weight: float
     """Weight of the camera-motion prior."""
 
     noise_std_floor: float
-    """Normalized units; added to σ in quadrature."""
+    """Floor of the noise standard deviation, normalized units; added to σ in quadrature."""
 
     smoothness: float = SMOOTHNESS
     """κ."""
 
     ordered: bool = True
-    """Whether T is a random walk over frames, or the identity."""
+    """Whether T is a random walk over frames; otherwise it is the identity."""
 
     factor: Floats = field(default_factory=lambda: np.zeros((0, 0)))
-    """F₀ with F₀F₀ᵀ = G, shape `(2F, r)`; that of `gram` unless given, as for films whose Gram matrix would be too large."""
+    """F₀ with F₀F₀ᵀ = G, shape `(2F, r)`; computed from `gram` unless given, as for films whose Gram matrix would be too large."""
 
     def __post_init__(self) -> None:
         """Factor the Gram matrix."""
@@ -143,7 +143,7 @@ class Scene:
 
 
 def start(scene: Scene, scales: Floats, *, num_modes: int = NUM_MODES) -> Motion:
-    """Return a rigid explanation and, from its residual, the leading modes in time."""
+    """Return starting parameters: a rigid shape and, from its residual, the leading modes over time."""
     frames = len(scene.rotations)
     rows = (scene.rotations[:, :2] * scales[:, None, None]).reshape(2 * frames, 3)
     inverse = np.linalg.pinv(rows)
@@ -180,7 +180,7 @@ def cameras_of(scene: Scene, motion: Moved) -> tuple[Floats, Floats]:
 
 
 def cameras_and_jacobian(scene: Scene, motion: Moved) -> tuple[Floats, Floats, Floats]:
-    """Return the same and the left Jacobians of the turns, shape `(F, 3, 3)`."""
+    """Return rotations (F, 3, 3), scales (F,), and the left Jacobians of the turns, shape `(F, 3, 3)`."""
     turned, jacobian = exponential_and_jacobian(motion.turns)
     rotations = turned @ scene.rotations
     if not scene.with_scales:
@@ -222,7 +222,7 @@ def energy_with_inverse(scene: Scene, motion: Motion) -> tuple[float, Motion, Fl
     return value, gradient, inverted(image_of(scene, motion).covariance())[0]
 
 
-# A line search may try a step far too long: that energy is `UNLIKELY`.
+# A line search may try a step that overflows: its energy is then `UNLIKELY`.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     """Return E with the penalties on modes, rotations and scales, and its gradient, analytic in every parameter.
@@ -284,7 +284,7 @@ def fit(
     """
     frames = len(scene.rotations)
     held = 0 if turning else 3 * frames
-    # The metric is that of the whole film's likelihood, the energy that of one frame.
+    # The metric belongs to the likelihood of all frames; the energy is per frame.
     factor = 1 if metric is None else frames
     given = (motion if metric is None else _over_frames(metric.coordinates, motion)).flat()
 
@@ -309,7 +309,7 @@ def fit(
 
 
 def metric_of(scene: Scene, motion: Motion) -> FrameMetric:
-    """Return the metric of the likelihood at some parameters, for `fit`."""
+    """Return the metric of the likelihood at these parameters, for `fit`."""
     noise, walk_variance = np.exp(2 * motion.logs)
     return FrameMetric.of(
         motion.modes,
@@ -320,7 +320,7 @@ def metric_of(scene: Scene, motion: Motion) -> FrameMetric:
 
 
 def _over_frames(change: Callable[[Floats], Floats], motion: Motion) -> Motion:
-    """Return parameters, or a gradient, with turns, scales and modes changed over the frames."""
+    """Apply `change` over the frames to turns, scales and modes, of parameters or of a gradient."""
     changed = change(np.hstack([motion.turns, motion.log_scales[:, None], motion.modes]))
     return replace(motion, turns=changed[:, :3], log_scales=changed[:, 3], modes=changed[:, 4:])
 

@@ -1,11 +1,11 @@
 """Model order: the number of modes and the starting noise, chosen by held-out negative log likelihood.
 
 A covariance over F frames with many modes, learned from few points, fits those points only: it explains their noise
-by modes. In addition EM changes the noise slowly: from a low start, strong noise is absorbed by the random walk; from
-a high start, fine deformation counts as noise. Where the tracks are rougher than smooth motion, one half of the
-points is learned from and the other half scored, then vice versa, with both starts and a growing number of modes.
+by modes. In addition, EM changes the noise slowly: from a low start, the random walk absorbs strong noise; from a high
+start, fine deformation counts as noise. If the tracks are rougher than smooth motion, a covariance learned from one half
+of the points is scored on the other, and vice versa, with both starts and a growing number of modes.
 
-Without noise, additional modes do no harm and keep deformation out of the cameras, so nothing is limited.
+Without noise, additional modes do no harm and keep deformation out of the cameras, so their number is not limited.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class ModelOrder:
     """Whether EM starts with the roughness of the tracks as its noise, instead of a low noise."""
 
     ordered: bool = True
-    """Whether the frames are those of a film, or photographs in no order."""
+    """True for a film, False for photographs in no order."""
 
 
 def select_model_order(
@@ -66,7 +66,7 @@ def select_model_order(
     Parameters
     ----------
     sample : array, shape (F, S, 2)
-        Some points of centred, complete tracks, normalized units.
+        Sampled points of centred, complete tracks, normalized units.
     projections : array, shape (F, 2, 3)
         s_f times the first two rows of R_f.
     ordered : bool
@@ -74,7 +74,7 @@ def select_model_order(
     seed : int
         Seed of the split into halves.
     should_stop : callable, optional
-        Called after every round of EM; once it returns True, orders not yet scored count as improbable.
+        Called after every round of EM; once it returns True, orders not yet scored are not considered.
     """
     frames, count = sample.shape[:2]
     if count < MIN_JUDGED_POINTS or typical_roughness(sample) < NOISE_STD_FLOOR:
@@ -97,7 +97,7 @@ def select_model_order(
 
 
 def _counts(frames: int) -> list[int]:
-    """Return those of `MODE_COUNTS` that differ for this number of frames; there are fewer modes than frames."""
+    """Return the `MODE_COUNTS` that differ for this number of frames; there are fewer modes than frames."""
     return [count for count in MODE_COUNTS[:-1] if count < frames - 1] + [MAX_MODES]
 
 
@@ -132,9 +132,9 @@ def _judged(
 
 
 def held_out_nll(covariance: ShapeCovariance, projections: Floats, other: Floats) -> float:
-    """Return the negative logarithm of the likelihood of points that were not learned from, per point and frame.
+    """Return the mean negative log likelihood of held-out points, per point and frame.
 
-    The tenth of them that is least probable does not count: what completion left of gross outliers.
+    The least probable tenth of them is excluded: it may contain gross outliers that completion left.
     """
     each = np.sort(negative_log_likelihoods(covariance.image_model(projections), other))
     return float(each[: -(-9 * len(each) // 10)].mean())

@@ -7,15 +7,15 @@ noise is not σ² distinguish the observations from complete tracks. With K = S�
 
     C = (K_MM + diag(1/δ))⁻¹,    E[w_M | z] = z_M − C (K z)_M,    Cov[w_M | z] = C,
 
-while the other entries are what was observed. The inverse covariance of the observations is K − K_·M C K_M·, from which the prediction of
+while the other entries equal the observations. The inverse covariance of the observations is K − K_·M C K_M·, from which the prediction of
 every observation from all others of its point follows (leave-one-out). A point costs O(|M|³ + F|M|²).
 
 An observation is an inlier, or an outlier with a uniform density over an area A. With a share α of outliers and the predicted density p,
 
     π = (1 − α) p / ((1 − α) p + α / A),    α = mean of 1 − π.
 
-A learned covariance overrates its predictions. Their covariances are therefore multiplied by the factor, if it is more than 1, at which
-the median of the squared Mahalanobis distances is that of a χ² distribution of two degrees of freedom.
+A learned covariance makes overconfident predictions. Their covariances are therefore multiplied by a factor, at least 1, with which
+the median of the squared Mahalanobis distances is that of a χ² distribution with two degrees of freedom.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ MIN_INLIER_PROBABILITY = 1e-3
 """Floor of π where an observation is predicted from the others: keeps its own noise finite. Not tuned."""
 
 SHARE_BOUNDS = (1e-3, 0.5)
-"""Bounds of α: at 0 no observation could be an outlier any more, and beyond half the inliers are not the majority."""
+"""Bounds of α: at 0 no observation could become an outlier, and beyond half the inliers are not the majority."""
 
 CHI2_MEDIAN = float(2 * np.log(2))
-"""Median of the χ² distribution of two degrees of freedom."""
+"""Median of the χ² distribution with two degrees of freedom."""
 
 CERTAIN = 0.99
-"""Weight from which an observation counts in full: its noise is less than 1 % more, and only the others cost time."""
+"""Weight above which an observation counts in full: its noise is about 1 % larger at most, and only the others cost time."""
 
 BATCH_NUMBERS = 4_000_000
-"""Numbers of K_·M that are held at once."""
+"""Maximum number of entries of K_·M in memory at once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Conditionals:
-    """What their observations tell about the complete tracks of some points; padded to the same number of rows."""
+    """Posterior covariances of the complete tracks of some points, padded to the same number of rows."""
 
     points: NDArray[np.intp]
     """Shape `(n,)`."""
@@ -63,7 +63,7 @@ class Conditionals:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageDensity:
-    """Density of complete tracks."""
+    """Gaussian density of complete tracks."""
 
     precision: Floats
     """K, shape `(2F, 2F)`, of the coordinates x1, y1, x2 and so on."""
@@ -73,7 +73,7 @@ class ImageDensity:
 
     @classmethod
     def of(cls, covariance: Floats, noise: float, *, least: float = 0.0) -> ImageDensity:
-        """Return the density of S, shape `(2F, 2F)`, which contains the noise σ²; the noise is raised to `least`."""
+        """Return the density for S, shape `(2F, 2F)`, which includes the noise σ²; noise below `least` is raised to it."""
         raised = max(least - noise, 0.0)
         factor = linalg.cho_factor(covariance + raised * np.eye(len(covariance)), lower=True, check_finite=False)
         precision = linalg.cho_solve(factor, np.eye(len(covariance)), check_finite=False)
@@ -103,7 +103,7 @@ class ImageDensity:
         return means, total
 
     def left_out(self, points: Floats, confidence: Floats, weight: Floats) -> tuple[Floats, Floats]:
-        """Return how far each observation lies from its prediction by the others of its point.
+        """Return how far each observation lies from its prediction by the other observations of its point.
 
         Parameters
         ----------
@@ -139,7 +139,7 @@ class ImageDensity:
         return _predicted(pulled, (xx, yy, xy), self.noise * (1 / confidence - 1 / weight))
 
     def _conditionals(self, weight: Floats) -> Iterator[Conditionals]:
-        """Yield the points that have entries of less weight, those with as many of them together."""
+        """Yield batches of points with entries of weight below `CERTAIN`, sorted by the number of these entries."""
         changed = weight < CERTAIN
         counts = changed.sum(axis=0)
         order = np.argsort(counts, kind="stable")
@@ -182,10 +182,10 @@ def _predicted(pulled: Floats, blocks: tuple[Floats, Floats, Floats], own: Float
 def inlier_probabilities(
     covariance: Floats, noise: float, points: Floats, confidence: Floats, weight: Floats, *, share: float
 ) -> tuple[Floats, float]:
-    """Return the probability of every observation, shape `(F, P)`, 0 where hidden, and the share of outliers.
+    """Return the inlier probability of every observation, shape `(F, P)`, 0 where hidden, and the share of outliers.
 
-    The noise counts as `completion.MIN_RESIDUAL_SCALE` at least: where a covariance was learned without noise, the model is less exact than
-    its predictions.
+    The noise standard deviation is at least `completion.MIN_RESIDUAL_SCALE`: predictions of a covariance learned without noise claim more
+    precision than the model has.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def inlier_probabilities(
     points, confidence, weight
         As for `ImageDensity.left_out`.
     share : float
-        α.
+        α to start from.
     """
     seen, found = confidence > 0, np.zeros(confidence.shape)
     if not seen.any():

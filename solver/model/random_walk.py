@@ -1,7 +1,7 @@
-"""A random walk of every point's position, given its images: means, variances and determinants in time linear in the frames.
+"""A random walk of a point's position, given its images: means, variances and determinants in time linear in the frames.
 
 The walk x ∈ R^{3F} has covariance τ (T ⊗ I₃), T⁻¹ = n (HᵀH + 10/F² I) with H the first difference over frames and n such that the mean
-of T's diagonal is 1; its images are w = B x + N(0, σ² I), B = blockdiag(B_f) of 2×3. What everything needs is the precision of x given w,
+of T's diagonal is 1; its images are w = B x + N(0, σ² I), B = blockdiag(B_f) of 2×3. All results follow from the precision of x given w,
 
     Λ = T⁻¹/τ ⊗ I₃ + BᵀB/σ²,
 
@@ -9,7 +9,7 @@ block tridiagonal with 3×3 blocks. With D = σ²I + τ B (T ⊗ I₃) Bᵀ, the
 give D⁻¹ = (I − B Λ⁻¹ Bᵀ/σ²)/σ² and log det D = 2F log σ² + log det Λ + log det τT ⊗ I₃. Golub and Van Loan, Matrix Computations,
 2.1.4 and 4.5.1.
 
-Photographs in no order have no walk: with `ordered` False T is the identity, an independent deviation of every frame, and all else stays.
+Photographs in no order have no walk: with `ordered` False, T is the identity, and each frame deviates independently.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ FRAMES_PER_BLOCK = 8
 """Frames eliminated together, as one dense block: of 4, 8 and 12 the fastest for 120 to 1,000 frames and 90 to 350 columns."""
 
 LEVEL = 10.0
-"""Precision of the walk's mean level, as a multiple of n/F²: it keeps T⁻¹ invertible and binds the level hardly at all."""
+"""Precision of the walk's mean level, as a multiple of n/F²: it keeps T⁻¹ invertible and hardly constrains the level."""
 
 
 @lru_cache(maxsize=32)
 def walk_bands(num_frames: int, ordered: bool = True) -> tuple[Floats, float]:
-    """Return HᵀH + 10/F² I by its upper bands, shape `(2, F)`, and n, the mean of its inverse's diagonal.
+    """Return the upper bands of HᵀH + 10/F² I, shape `(2, F)`, and n, the mean of its inverse's diagonal.
 
-    Unordered: the identity and 1.
+    If unordered, return those of the identity, and 1.
     """
     bands = np.zeros((2, num_frames))
     if not ordered:
@@ -87,7 +87,7 @@ def whitener(num_frames: int, ordered: bool = True) -> Floats:
 
 @lru_cache(maxsize=32)
 def whitener_bands(num_frames: int) -> Floats:
-    """Return the same by its lower bands, shape `(2, F)`; read-only."""
+    """Return the lower bands of the root in `whitener`, shape `(2, F)`; read-only."""
     bands, norm = walk_bands(num_frames)
     root: Floats = lapack.dpbtrf(bands * norm, lower=1)[0]
     read_only(root)
@@ -105,7 +105,7 @@ def whitened(columns: Floats, *, ordered: bool = True) -> Floats:
 
 
 def coloured(columns: Floats, *, ordered: bool = True, transposed: bool = False) -> Floats:
-    """Return root⁻ᵀ times columns of shape `(F, k)`, the inverse of `whitened`; `transposed`: root⁻¹ times them."""
+    """Return root⁻ᵀ times columns of shape `(F, k)`, the inverse of `whitened`; if `transposed`, root⁻¹ times the columns."""
     if not ordered or columns.shape[1] == 0:  # LAPACK writes beyond an array without columns
         return columns
     bands = whitener_bands(len(columns))
@@ -127,14 +127,13 @@ def walk_precision(num_frames: int, ordered: bool = True) -> tuple[Floats, float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WalkPosterior:
-    """Λ, eliminated."""
+    """Block elimination of Λ."""
 
     inverses: Floats
-    """Inverses of the pivot blocks, shape `(N, 3b, 3b)`, b = `FRAMES_PER_BLOCK`; the
-    last is padded with the identity."""
+    """Inverses of the pivot blocks, shape `(N, 3b, 3b)`, b = `FRAMES_PER_BLOCK`; the last is padded with the identity."""
 
     coupling: float
-    """What couples neighbouring frames in −Λ, per axis."""
+    """Entry of −Λ between neighbouring frames, equal for every axis."""
 
     variances: Floats
     """Diagonal blocks of Λ⁻¹, shape `(F, 3, 3)`."""
@@ -144,12 +143,12 @@ class WalkPosterior:
 
     @classmethod
     def of(cls, images: Floats, *, noise_variance: float, walk_variance: float, ordered: bool = True) -> WalkPosterior:
-        """Eliminate for B_f of shape `(F, 2, 3)`, σ² and τ.
+        """Factor Λ for B_f of shape `(F, 2, 3)`, σ² and τ.
 
         Raises
         ------
         numpy.linalg.LinAlgError
-            Rounding left Λ indefinite, or it is not finite.
+            Λ is indefinite to rounding, or not finite.
         """
         frames = len(images)
         bands, norm = walk_bands(frames, ordered)

@@ -1,13 +1,13 @@
-"""Resection: cameras and deformations of frames that a covariance was not learned from, by the points' posterior mean shapes.
+"""Resection: cameras and deformations of frames outside those that the covariance was learned from, by posterior mean shapes.
 
-The covariance of some frames of a film (`model.shape_covariance`) gives each of their points a posterior mean position μ_p and posterior
-mean modes b_kp. Every frame of the film then is
+A covariance learned from some frames of a film (`model.shape_covariance`) gives each of their points a posterior mean position μ_p and
+posterior mean modes b_kp. Every frame of the film is then
 
     w_fp = s_f R_f (μ_p + Σ_k l_fk b_kp) + t_f + noise,
 
-a non-linear least-squares problem of 5 + k unknowns that no other frame takes part in: the cost is linear in the frames. Residuals have
-the Cauchy loss. R_f and l_f have Gaussian priors about what lies between the learned neighbours, with the covariances by which learned
-frames deviate from the middle of theirs: slow motion is interpolated, motion faster than the learned frames is free.
+a non-linear least-squares problem with 6 + k unknowns, 5 + k without scales. Frames are independent, so the cost is linear in their
+number. Residuals have the Cauchy loss. R_f and l_f have Gaussian priors about the interpolation between the learned neighbours, with the
+covariances of the learned frames' deviations from the middle of theirs: slow motion is interpolated, fast motion follows the images.
 Levenberg–Marquardt on SO(3) (Hartley and Zisserman, Multiple View Geometry, 2004, 7.2 and A6), many frames at once.
 """
 
@@ -27,7 +27,7 @@ from pliant.solver.threads import over_ranges
 from scipy.spatial.transform import Rotation, Slerp
 
 MAX_STEPS = 12
-"""Maximum number of steps for a frame."""
+"""Maximum number of Levenberg–Marquardt steps per frame."""
 
 SETTLED = 1e-5
 """Relative decrease of a frame's cost below which it has converged."""
@@ -39,15 +39,15 @@ OUTLYING = 3.0
 """Residual, in standard deviations, at which the Cauchy loss halves a weight, as in `tracks.completion`."""
 
 LEARNED_DOUBT = 1e-3
-"""Prior variance in a learned frame over that midway between two: such frames hardly move."""
+"""Prior variance in a learned frame relative to that midway between two; learned frames hardly move."""
 
 MIN_RELATIVE_DISTANCE = 0.2
-"""Least 1 + κz: no point comes nearer to the camera than a fifth of the distance of the shape's origin."""
+"""Minimum of 1 + κz: no point is nearer to the camera than a fifth of the distance of the shape's origin."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeanShapes:
-    """What the learned frames say about each point."""
+    """Posterior mean shape and modes of each point, given the learned frames."""
 
     mean: Floats
     """μ, shape `(3, S)`."""
@@ -59,14 +59,14 @@ class MeanShapes:
     """Inverse covariance of the coefficients l_f midway between two learned frames about their mean, shape `(k, k)`."""
 
     turn_precision: Floats
-    """The same of the rotation vector of R_f relative to its mean, shape `(3, 3)`."""
+    """Likewise for the rotation vector of R_f relative to its mean, shape `(3, 3)`."""
 
     variance: float
     """Variance of an image coordinate about its prediction: noise and random walk."""
 
     @classmethod
     def of(cls, covariance: ShapeCovariance, rotations: Floats, scales: Floats, sample: Floats) -> MeanShapes:
-        """Return them for cameras and complete tracks `(F, S, 2)` of the frames that the covariance was learned from."""
+        """Return the shapes for cameras and complete tracks `(F, S, 2)` of the frames that the covariance was learned from."""
         projections = rotations[:, :2] * scales[:, None, None]
         frames, count = covariance.modes.shape
         images = sample.transpose(0, 2, 1).reshape(2 * frames, -1)
@@ -89,7 +89,7 @@ class MeanShapes:
 
 
 def _precision(deviations: Floats) -> Floats:
-    """Return the inverse of the second moment of deviations `(n, m)`, kept finite."""
+    """Return the inverse of the second moment of deviations `(n, m)`, regularised."""
     moment = deviations.T @ deviations / max(len(deviations), 1)
     ridge = 1e-9 * max(float(np.trace(moment)), 1e-3)
     return np.asarray(np.linalg.inv(moment + ridge * np.eye(len(moment))))
@@ -109,13 +109,13 @@ class Views:
     """κ."""
 
     def part(self, chosen: slice | NDArray[np.intp]) -> Views:
-        """Return some of the frames."""
+        """Return the chosen frames."""
         return replace(self, points=self.points[chosen], weight=self.weight[chosen])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """Unknowns of the frames."""
+    """Unknowns of the frames, and their priors."""
 
     rotations: Floats
     """Shape `(n, 3, 3)`."""
@@ -136,14 +136,14 @@ class Poses:
     """Prior mean of the rotations, shape `(n, 3, 3)`."""
 
     doubt: Floats
-    """Prior variances over those midway between learned frames, shape `(n,)`."""
+    """Prior variances relative to those midway between learned frames, shape `(n,)`."""
 
     def part(self, chosen: slice | NDArray[np.intp]) -> Poses:
-        """Return some of the frames."""
+        """Return the chosen frames."""
         return Poses(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
     def where(self, better: NDArray[np.bool_], other: Poses) -> Poses:
-        """Return those of `other` where `better`."""
+        """Return these poses, replaced by those of `other` in the frames where `better`."""
         pairs = ((getattr(self, each.name), getattr(other, each.name)) for each in fields(self))
         return Poses(*(np.where(better.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in pairs))
 
@@ -171,20 +171,20 @@ def resected(
     with_scales: bool,
     should_stop: Callable[[], bool] | None = None,
 ) -> Poses:
-    """Return the most probable poses of every frame.
+    """Return the most probable pose of every frame.
 
     Parameters
     ----------
     views : Views
         n frames of S points.
     shapes : MeanShapes
-        Of these points.
+        Shapes of the same points.
     start : Poses
-        A frame starts here, and if `turning` also at the pose in which the mean shape fits it best; the more probable end is returned.
+        Starting poses. If `turning`, frames also start at the best pose of the mean shape; the more probable result is returned.
     turning, with_scales : bool
-        False keeps rotations, scales.
+        False keeps the rotations or the scales, respectively.
     should_stop : callable, optional
-        Called between groups of frames; once it returns True, the others stay at their start.
+        Called between groups of frames; once it returns True, the remaining frames keep their starting poses.
     """
     done: list[Poses] = []
     group = 2 * FRAMES_TOGETHER
@@ -217,7 +217,7 @@ def _resected(views: Views, shapes: MeanShapes, start: Poses, turning: bool, wit
 
 
 def rigid(views: Views, shapes: MeanShapes, begun: Poses) -> Poses:
-    """Return the poses in which the mean shape fits best, without deformation: the nearest rotation to an affine camera."""
+    """Return the poses in which the undeformed mean shape fits best: the rotation nearest to an affine camera."""
     weight = views.weight[:, None]
     total = np.maximum(weight.sum(axis=2, keepdims=True), np.finfo(float).tiny)
     middle = (weight * views.points).sum(axis=2, keepdims=True) / total
@@ -233,7 +233,7 @@ def rigid(views: Views, shapes: MeanShapes, begun: Poses) -> Poses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
-    """A pose with what its derivatives need."""
+    """Residuals at a pose, and what its derivatives need."""
 
     turned: Floats
     """s R x, shape `(n, 3, S)`."""
@@ -242,7 +242,7 @@ class _Fit:
     """Residuals, shape `(n, 2, S)`."""
 
     omega: Floats
-    """Weights over the variance, shape `(n, S)`."""
+    """Robust weights divided by the variance, shape `(n, S)`."""
 
     cost: Floats
     """Negative log posterior, shape `(n,)`."""
@@ -280,7 +280,7 @@ def _fit(views: Views, shapes: MeanShapes, poses: Poses) -> _Fit:
 def _descended(
     views: Views, shapes: MeanShapes, poses: Poses, turning: bool, with_scales: bool
 ) -> tuple[Poses, Floats]:
-    """Return poses and their costs after steps of Levenberg and Marquardt."""
+    """Return poses and their costs after Levenberg–Marquardt steps."""
     at = _fit(views, shapes, poses)
     damping = np.full(len(at.cost), 1e-3)
     for _ in range(MAX_STEPS):

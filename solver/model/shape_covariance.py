@@ -7,8 +7,8 @@ A point's world positions over all frames, x ∈ R^{3F}, are draws from one zero
 that is, a mean position with covariance A₀ (3×3) and a deformation with covariance C over frames (F×F: modes L, and a
 random walk T for the remainder) and A₁ over axes (3×3, trace 3). The tracks observe two of three coordinates per
 frame, W = Π X + noise of variance σ² with Π = blockdiag(s_f R_f). The unobserved coordinate is integrated out, so
-unknown depth is not counted as flat; a penalty on the estimated shapes (`pliant.solver.energy.low_rank`) shrinks
-depth instead.
+unknown depth is not treated as flat, whereas a penalty on the estimated shapes (`pliant.solver.energy.low_rank`)
+shrinks depth.
 
 `model.expectation_maximisation` learns the parameters.
 """
@@ -53,10 +53,10 @@ class ShapeCovariance:
     """σ², variance of an image coordinate."""
 
     nll: float
-    """Negative log likelihood per point and frame of the covariance that EM improved to this one; ∞ at the start."""
+    """Negative log likelihood, per point and frame, of the covariance before the last EM round; ∞ at the start."""
 
     ordered: bool = True
-    """Whether T is a random walk over frames, or the identity: photographs in no order."""
+    """Whether T is a random walk over frames; for photographs in no order it is the identity."""
 
     def over_frames(self) -> Floats:
         """Return C, shape `(F, F)`."""
@@ -72,7 +72,7 @@ class ShapeCovariance:
     def of_image(self, projections: Floats, used: NDArray[np.intp] | None = None) -> Floats:
         """Return V = ΠΣΠᵀ + σ²I, shape `(2F, 2F)`; `projections` (F, 2, 3) are s_f times the first two rows of R_f.
 
-        With `used` both are of these frames only.
+        With `used`, both cover these frames only.
         """
         rows = projections.reshape(-1, 3)
         over_frames = self.over_frames() if used is None else self.over_frames_at(used)

@@ -6,7 +6,7 @@ import numpy as np
 from pliant.solver.records import Floats
 
 SMALL_ANGLE = 1e-4
-"""Below this angle (rad) the closed forms cancel; their Taylor series to second order is exact to 1e-17."""
+"""Angle, rad, below which the closed forms suffer cancellation; their Taylor series to second order is exact to 1e-17."""
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
 """The depth mirror D: (S, R) and (S·D, D·R·D) have the same orthographic image."""
@@ -45,12 +45,12 @@ def exponential(vectors: Floats) -> Floats:
 
 
 def logarithm(rotations: Floats) -> Floats:
-    """Return the vectors v, ‖v‖ ≤ π, of which the rotations are the exponentials, shapes `(..., 3, 3)` to `(..., 3)`."""
+    """Return the rotation vectors v, ‖v‖ ≤ π, whose exponentials are the rotations, shapes `(..., 3, 3)` to `(..., 3)`."""
     sine = 0.5 * vee(rotations)
     length = np.linalg.norm(sine, axis=-1)
     angle = np.arctan2(length, 0.5 * (np.trace(rotations, axis1=-2, axis2=-1) - 1.0))
     axis = sine / np.maximum(length, np.finfo(float).tiny)[..., None]
-    # near half a turn the sine vanishes: the axis is then the leading eigenvector of R + Rᵀ, its sign that of the sine
+    # near half a turn the sine vanishes: the axis is the leading eigenvector of R + Rᵀ, with the sign of the sine vector
     opposite = angle > np.pi - 1e-3
     if np.any(opposite):
         leading = np.linalg.eigh(rotations[opposite] + np.swapaxes(rotations[opposite], -1, -2))[1][..., -1]

@@ -1,11 +1,11 @@
 """Hierarchy of coarser surfaces for the multilevel preconditioner, by smoothed aggregation.
 
-Blocks per point ignore the spatial term, which couples points over any distance: smooth deformations cost almost nothing
-in it, so conjugate gradients would need as many iterations as the surface is wide. On coarser levels the same
-deformations are rough. Each level aggregates points around centres, no two of which share a neighbour (chosen in
+A preconditioner with one block per point ignores the coupling by the spatial term. Smooth deformations cost almost nothing
+in that term, so conjugate gradients would need about as many iterations as the surface is wide in points. On coarser levels
+the same deformations are rough. Each level aggregates points around centres, no two of which share a neighbour (chosen in
 parallel by largest random number: Luby, 1986), and smooths the aggregates once over the graph (Vaněk, Mandel, Brezina
-1996). The corrections of all levels are added (Bramble, Pasciak, Xu 1990), so only the blocks of each level are solved.
-The columns of every Π_l have unit length, so the temporal term is the same on all levels.
+1996). The corrections of all levels are added (Bramble, Pasciak, Xu 1990), so each level needs only the inverses of its
+blocks. The columns of every Π_l have unit length, so the temporal term is the same on all levels.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from scipy import sparse
 Matrix = sparse.csr_array[Any]
 
 COARSEST = 8
-"""Number of points below which no further level is built."""
+"""Number of points at or below which no further level is built."""
 
 SMOOTHING = 0.6
 """Weight of the neighbours' mean in the smoothing step."""
@@ -39,18 +39,18 @@ class Level:
     """Prolongation of corrections."""
 
     mean: Matrix
-    """Averaging of weights, rows of sum 1, shape `(P_l, P_l−1)`."""
+    """Averaging of weights, with rows of sum 1, shape `(P_l, P_l−1)`."""
 
     bending: Floats
     """Diagonal of ΠᵀAᵀAΠ, shape `(P_l,)`."""
 
     def rounded(self, kind: np.dtype[np.floating]) -> Level:
-        """Return the same in another precision."""
+        """Return the level in another precision."""
         return replace(self, down=self.down.astype(kind), up=self.up.astype(kind), mean=self.mean.astype(kind))
 
 
 def build_levels(laplacian: Matrix, *, seed: int = 0) -> tuple[Level, ...]:
-    """Return the levels below the points of a Laplacian A, shape `(P, P)`; `seed` is that of the choice of centres."""
+    """Return the coarser levels, finest first, for a Laplacian A, shape `(P, P)`; `seed` controls the choice of centres."""
     graph = _joined(abs(laplacian) + abs(laplacian.T))
     whole: Matrix = sparse.csr_array(sparse.eye_array(laplacian.shape[0], format="csr"))
     scale = np.ones(laplacian.shape[0])
@@ -82,7 +82,7 @@ def build_levels(laplacian: Matrix, *, seed: int = 0) -> tuple[Level, ...]:
 
 
 def _aggregates(graph: Matrix, seed: int) -> Matrix:
-    """Return the centre of each point as a 0/1 matrix, shape `(P, centres)`."""
+    """Return the assignment of points to centres as a 0/1 matrix, shape `(P, centres)`."""
     size = graph.shape[0]
     near = _joined(graph @ graph + graph)
     centre = _independent(near, seed)
@@ -111,7 +111,7 @@ def _independent(graph: Matrix, seed: int) -> NDArray[np.intp]:
 
 def _largest(graph: Matrix, values: NDArray[Any]) -> NDArray[Any]:
     """Return the largest value among each point's neighbours, −1 if it has none."""
-    padded = np.append(values[graph.indices], -1)  # a last row without neighbours would start beyond the end
+    padded = np.append(values[graph.indices], -1)  # otherwise a last row without neighbours would start beyond the end
     largest = np.maximum.reduceat(padded, graph.indptr[:-1])
     return np.where(np.diff(graph.indptr) > 0, largest, -1)
 

@@ -2,9 +2,9 @@
 
 The product of a sparse matrix with one vector is limited by memory bandwidth: every entry is loaded for one
 multiplication with a value at an arbitrary address. With points first and k vectors side by side, `(P, k)`, each entry
-is used for k contiguous values; this saves more than the transposition costs. Microseconds for AᵀA, one coordinate of
-one frame, 29,000 points of a triangle mesh: 162 alone, 86 + 38 for transposing with eight frames; 156 and 52 + 22 in
-single precision.
+is used for k contiguous values; this saves more than the transposition costs. Microseconds for AᵀA per coordinate and
+frame, 29,000 points of a triangle mesh: 162 for single vectors, 86 + 38 (transposition) for eight frames together; in
+single precision 156 and 52 + 22.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from pliant.solver.operators.mesh_laplacian import Laplacian
 Array = NDArray[np.floating]
 
 TOGETHER = 8
-"""Maximum number of frames multiplied together, 24 vectors."""
+"""Maximum number of frames multiplied together: 24 vectors."""
 
 TILE = 2048
-"""Points transposed at a time, so that they stay in the processor's cache."""
+"""Number of points transposed at a time, so that they fit in the processor's cache."""
 
 
 def bends_of(laplacian: Laplacian, rows: Array) -> Array:
-    """Return A times the rows, points first: shape `(P, k)` for rows of shape `(k, P)`."""
+    """Return the product of A with rows of shape `(k, P)`, points first, shape `(P, k)`."""
     bends: Array = laplacian.matrix @ transposed(rows)
     return bends
 
 
 def add_bending(laplacian: Laplacian, weight: float, rows: Array, out: Array) -> None:
-    """Add weight · AᵀA x to the rows of `out`, both of shape `(k, P)`."""
+    """Add weight · AᵀA x to `out` for every row x; `rows` and `out` have shape `(k, P)`."""
     back = laplacian.adjoint @ (laplacian.matrix @ transposed(rows, weight))
     add_transposed(back, out)
 
 
 def frames_together(num_frames: int) -> int:
-    """Return the number of frames to multiply together: at most a quarter of all, to leave work for other threads."""
+    """Return the number of frames to multiply together: about a quarter of all at most, to leave work for other threads."""
     return min(TOGETHER, -(-num_frames // 4))
 
 

@@ -10,10 +10,10 @@ from pliant.solver.records import Floats
 
 
 def difference_bands(num_frames: int, order: int) -> Floats:
-    """Return the upper bands of HᵀH, shape `(order + 1, F)`: `bands[k, f]` couples frames f and f + k (0 beyond the end).
+    """Return the upper bands of HᵀH, shape `(order + 1, F)`; `bands[k, f]` couples frames f and f + k (0 beyond the end).
 
-    H takes differences over frames: first order x[f+1] − x[f] (Dai, Deng, He 2017, eq. 3), second order
-    x[f+2] − 2x[f+1] + x[f]. A sequence shorter than the stencil uses the highest order that fits.
+    H takes differences over frames: x[f+1] − x[f] for order 1 (Dai, Deng, He 2017, eq. 3), x[f+2] − 2x[f+1] + x[f] for
+    order 2. A sequence shorter than the stencil uses the highest order that fits.
     """
     order = min(order, num_frames - 1)
     stencil = np.array([(-1.0) ** (order - k) * math.comb(order, k) for k in range(order + 1)])

@@ -1,11 +1,11 @@
-"""The inverse covariance of the Gaussian prior over frames, tridiagonal minus few modes: products linear in F.
+"""Precision matrix of the Gaussian prior over frames: tridiagonal minus a few modes, so that products are linear in F.
 
-For each coordinate c the covariance over frames is C_c = B⁻¹ + U_c U_cᵀ: a random walk, whose inverse B is tridiagonal, and modes. By
-Woodbury's identity
+For each coordinate c the covariance over frames is C_c = B⁻¹ + U_c U_cᵀ: a random walk, whose inverse B is tridiagonal, plus modes. By
+Woodbury's identity (Golub and Van Loan, Matrix Computations, 2.1.4)
 
     C_c⁻¹ = B − V_c V_cᵀ,    V_c = B U_c K⁻ᵀ,    K Kᵀ = I + U_cᵀ B U_c,
 
-two numbers per frame and one column per mode instead of F² numbers. Golub and Van Loan, Matrix Computations, 2.1.4.
+which stores two numbers per frame and one column per mode instead of F² numbers.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from scipy import linalg
 Array = NDArray[np.floating]
 
 POINT_BLOCK = 1024
-"""Points per unit of parallel work."""
+"""Number of points per unit of parallel work."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathPrior:
-    """Q_c = B − V_c V_cᵀ over frames."""
+    """Precision matrices Q_c = B − V_c V_cᵀ over frames, one per coordinate c."""
 
     bands: Floats
     """Upper bands of B, shape `(2, F)`: the diagonal, then the coupling of frames f and f + 1 (0 at the end)."""
@@ -46,23 +46,23 @@ class PathPrior:
         return cls(bands, (modes[0], modes[1], modes[2]))
 
     def scaled(self, factor: float) -> PathPrior:
-        """Return the same times a factor of at least 0."""
+        """Return Q_c times a nonnegative factor."""
         first, second, third = (factor**0.5 * each for each in self.modes)
         return PathPrior(factor * self.bands, (first, second, third))
 
     def rounded(self, kind: np.dtype[np.floating]) -> PathPrior:
-        """Return the same with modes in another precision."""
+        """Return Q_c with the modes in another precision."""
         first, second, third = (each.astype(kind) for each in self.modes)
         return PathPrior(self.bands, (first, second, third))
 
     def matrices(self) -> Floats:
-        """Return Q_c, dense `(3, F, F)`."""
+        """Return all Q_c as dense matrices, shape `(3, F, F)`."""
         frames = self.bands.shape[1]
         chain = _chained(self.bands, np.eye(frames))
         return np.stack([chain - each.astype(np.float64) @ each.T.astype(np.float64) for each in self.modes])
 
     def subtract_modes(self, shapes: Array, result: Array) -> None:
-        """Subtract V_c V_cᵀ X_c from each coordinate c of the result; B is applied by the operator's stencil."""
+        """Subtract V_c V_cᵀ X_c from each coordinate c of the result; the operator's stencil applies B."""
 
         def work(span: slice) -> None:
             for axis, modes in enumerate(self.modes):
@@ -71,7 +71,7 @@ class PathPrior:
         over_blocks(work, shapes.shape[2], rows=3 * len(shapes))
 
     def value(self, shapes: Array) -> float:
-        """Return Σ_c tr X_cᵀ Q_c X_c in double precision; for smooth paths it is a small difference of large numbers."""
+        """Return Σ_c tr X_cᵀ Q_c X_c in double precision, as it is a small difference of large numbers for smooth paths."""
         parts = np.zeros(-(-shapes.shape[2] // POINT_BLOCK))
         diagonal, beside = self.bands[0], self.bands[1, :-1]
         modes = [each.astype(np.float64) for each in self.modes]
@@ -90,9 +90,9 @@ class PathPrior:
         return float(parts.sum())
 
     def loosest(self, count: int) -> list[tuple[Floats, Floats]]:
-        """Return, for each coordinate, the directions of least precision under Q_c, `(F, k)`, and their precision, `(k,)`.
+        """Return, for each coordinate, the directions of least precision under Q_c, `(F, k)`, and their precisions, `(k,)`.
 
-        Rayleigh–Ritz in the span of U_c = B⁻¹ V_c K, which contains all directions of much more variance than the random walk.
+        Rayleigh–Ritz in the span of U_c = B⁻¹ V_c Kᵀ, which contains all directions with much more variance than the random walk.
         """
         found = []
         banded = np.stack([self.bands[0], self.bands[1]])[::-1].copy()

@@ -1,9 +1,9 @@
 """Spatial smoothness: the sparse Laplacian A of eq. 7 on a pixel grid or a triangle or quad mesh.
 
-Every kind approximates 3 h² ∇² with h the distance between neighbours, as the paper's sum of four second differences on a
-grid does, so λ2 has the same meaning on all meshes. No row contracts the boundary of an open surface: a grid uses only
-complete second differences, a mesh omits the rows of boundary vertices. A boundary vertex that appears in no other row
-keeps its first-difference row and so stays connected.
+Every kind approximates 3 h² ∇², with h the distance between neighbours, as does the paper's sum of four second differences
+on a grid, so λ2 has the same meaning on all meshes. To avoid contracting the boundary of an open surface, a grid uses only
+complete second differences, and a mesh omits the rows of boundary vertices. A boundary vertex that appears in no other row
+keeps its first-difference row, so that it stays connected.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy import sparse
 
 Matrix = sparse.csr_array[Any]
 STRENGTH = 12.0
-"""Factor from the mean of the neighbours minus the vertex, h²∇²/4 for neighbours in all directions, to 3 h²∇²."""
+"""Factor that scales the mean of the neighbours minus the vertex, h²∇²/4 for neighbours in all directions, to 3 h²∇²."""
 
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 """The paper's four second-difference filters: along a row, along a column, along both diagonals."""
@@ -37,7 +37,7 @@ class Laplacian:
     """`grid8`, `uniform` or `cotangent`."""
 
     adjoint: Matrix
-    """Aᵀ in compressed row form."""
+    """Aᵀ in compressed sparse row format."""
 
     grid: Ints | None = None
     """Point index of each grid cell, −1 for holes; None without a grid. Used by the cosine preconditioner."""
@@ -46,7 +46,7 @@ class Laplacian:
     """Coarser levels, finest first, for the preconditioner."""
 
     def rounded(self, kind: np.dtype[np.floating]) -> Laplacian:
-        """Return the same in another precision."""
+        """Return the Laplacian in another precision."""
         if self.matrix.dtype == kind:
             return self
         return replace(
@@ -68,9 +68,9 @@ def build_laplacian(
     kind : {"auto", "grid8", "uniform", "cotangent"}
         `auto` is `grid8` on a grid, else `uniform`.
     reference : array, shape (P, 3), optional
-        A typical shape, any unit; required for `cotangent` only.
+        A typical shape, in any unit, for the weights of `cotangent`; without it `cotangent` becomes `uniform`.
     seed : int
-        Of the coarser levels, which speed up the minimisation.
+        Seed of the coarser levels of the preconditioner.
     """
     if mesh is None or (len(mesh.faces) == 0 and mesh.grid is None):
         return None
@@ -86,7 +86,7 @@ def build_laplacian(
 
 
 def _grid_matrix(grid: Ints, num_points: int) -> Matrix:
-    """Return the sum of the complete second differences through each cell; first differences where there are none."""
+    """Return the sum of the complete second differences at each cell; first differences for points in none of them."""
     rows, columns, values = [], [], []
     edges = []
     for down, right in DIRECTIONS:
@@ -145,7 +145,7 @@ def _with_all_connected(matrix: Matrix, edges: Ints, weights: Floats) -> Matrix:
 
 
 def _boundary(mesh: Mesh) -> NDArray[np.intp]:
-    """Return the boundary vertices: those of edges that belong to one face only."""
+    """Return the vertices of edges that belong to one face only."""
     following = np.roll(mesh.faces, -1, axis=1)
     low, high = np.minimum(mesh.faces, following), np.maximum(mesh.faces, following)
     keys, count = np.unique(low.astype(np.int64) * mesh.num_points + high, return_counts=True)
@@ -154,7 +154,7 @@ def _boundary(mesh: Mesh) -> NDArray[np.intp]:
 
 
 def _cotangent_weights(mesh: Mesh, reference: Floats) -> Floats:
-    """Return (cot α + cot β)/2 of each edge of `mesh.edges` on the reference shape, from 1 % to 100 times the typical weight.
+    """Return (cot α + cot β)/2 for each edge on the reference shape, clipped to 1 % to 100 times the typical weight.
 
     Quads are split along both diagonals with half weight each; the diagonals themselves get no weight.
     """

@@ -5,8 +5,8 @@ For shapes X of layout `(F, 3, P)` the operator is
     𝒜 X = s² Rᵀ(ω ∘ (R X))  +  λ1 (HᵀH) X  +  λ2 X (AᵀA)  +  Q X
 
 with a 2×3 projection per frame, a stencil over frames, a sparse product over points, and the F×F matrix Q of the
-low-rank prior, stored as a multiple of the identity minus a few modes. The Gaussian prior supplies its own stencil and
-modes. The weights ω occur in 𝒜 and in the right-hand side (the paper's printed eq. 9 has them in 𝒜 only).
+low-rank prior, stored as a multiple of the identity minus a few modes. A Gaussian prior has its own stencil and modes.
+The weights ω appear both in 𝒜 and in the right-hand side (the paper's printed eq. 9 has them in 𝒜 only).
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ Array = NDArray[np.floating]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RankTerm:
-    """Q = level · I − U diag(drop) Uᵀ over frames: the quadratic that majorises the low-rank prior."""
+    """Quadratic that majorises the low-rank prior: Q = level · I − U diag(drop) Uᵀ over frames."""
 
     level: float
-    """Weight of all directions outside the kept modes, λ included."""
+    """Weight of all directions outside the modes, including λ3."""
 
     modes: Floats
-    """U, orthonormal columns, shape `(F, k)`."""
+    """U, with orthonormal columns, shape `(F, k)`."""
 
     drop: Floats
-    """Reduction of the penalty of each mode below `level`, shape `(k,)`, in [0, level)."""
+    """Difference between `level` and the weight of each mode, shape `(k,)`, in [0, level)."""
 
     def matrix(self) -> Floats:
-        """Return Q, dense `(F, F)`."""
+        """Return Q as a dense matrix, shape `(F, F)`."""
         return self.level * np.eye(len(self.modes)) - (self.modes * self.drop) @ self.modes.T
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Operator:
-    """The parts of 𝒜; `weights` and `rank` change with every reweighting."""
+    """The operator 𝒜; `weights` and `rank` change with every reweighting."""
 
     projections: Array
     """s_f times the first two rows of R_f, shape `(F, 2, 3)`."""
 
     weights: Array
-    """ω of every coordinate, confidence included, shape `(F, 2, P)`."""
+    """ω of every coordinate, including the confidence, shape `(F, 2, P)`."""
 
     bands: Floats
     """λ1 times the upper bands of HᵀH, shape `(order + 1, F)`."""
@@ -62,11 +62,11 @@ class Operator:
     rank: RankTerm | None = None
 
     quadratic: PathPrior | None = None
-    """The Gaussian prior over frames of each coordinate, which brings its own stencil."""
+    """The Gaussian prior over frames of each coordinate; its stencil replaces `bands`."""
 
     @property
     def stencil(self) -> Floats:
-        """Upper bands over frames of the prior in use, shape `(order + 1, F)`."""
+        """Upper bands of the prior in use over frames, shape `(order + 1, F)`."""
         return self.bands if self.quadratic is None else self.quadratic.bands
 
     def apply(self, shapes: Array, /, out: Array | None = None) -> Array:
@@ -105,7 +105,7 @@ class Operator:
         return result
 
     def rounded(self, kind: np.dtype[np.floating]) -> Operator:
-        """Return the same in another precision."""
+        """Return the operator in another precision."""
         return replace(
             self,
             projections=self.projections.astype(kind),
@@ -145,5 +145,5 @@ class Operator:
 
 
 def rows_of(shapes: Array) -> Array:
-    """Return frames and coordinates as rows, shape `(3F, P)`, without copying."""
+    """Return a view of the shapes with frames and coordinates as rows, shape `(3F, P)`."""
     return shapes.reshape(-1, shapes.shape[2])

@@ -1,10 +1,10 @@
-"""Shapes of more points than fit into memory at once: block by block, each with a margin of its neighbours.
+"""Shapes of more points than fit into memory at once: block by block, each with a margin of neighbouring points.
 
-Given cameras, prior and translations, points are coupled by the bending of the surface alone, whose influence decays over some rings of
-the mesh. A block therefore needs its surroundings only: overlapping blocks solved once (Toselli and Widlund, Domain
-Decomposition Methods, 2005, chapter 1). Memory beyond the tracks and the result is that of one block. Frames are not centred within
-blocks but at the end, over all points, and translations are those of the cameras. What belongs to the whole object is computed once: the
-weight of bending, and the changes by what cameras and prior were learned from.
+Given cameras, prior and translations, only the bending of the surface couples points, and its influence decays over a few rings of the
+mesh. Overlapping blocks therefore need to be solved only once (Toselli and Widlund, Domain Decomposition Methods, 2005, chapter 1). Beyond
+the tracks and the result, the memory needed is that of one block. Translations are those of the cameras; frames are centred over all points
+at the end, not within blocks. Quantities of the whole object are computed once: the weight of bending and the jackknife of cameras and
+prior.
 """
 
 from __future__ import annotations
@@ -41,22 +41,22 @@ from pliant.solver.solution import Outcome, Solution, Trace
 from pliant.solver.storage import allocated, let_go
 
 MARGIN = 4
-"""Rings of neighbours around a block. Shapes of a face of 20 × 4,000 in four blocks differ from those solved at once by .0011, .0010, .0010
-and .0010 of its size (RMS) with 2, 4, 8 and 16 rings, with the smooth prior by .0032, .0031, .0032 and .0033; of 20 × 20,000 by .0003 and
-.0033 with any of them. What is left comes from where the reweightings end."""
+"""Rings of neighbours around a block. For a face of 20 × 4,000 in four blocks with 2, 4, 8 and 16 rings, shapes differ from those solved at
+once by .0011, .0010, .0010 and .0010 of its size (RMS), with the smooth prior by .0032, .0031, .0032 and .0033; for 20 × 20,000 by .0003
+and .0033 with any of them. The remaining difference comes from where the reweightings end."""
 
 JUDGED_POINTS = 20_000
-"""Points, evenly spread, by which the whole result is judged."""
+"""Maximum number of points, at equal steps of the index, from which the verdict on the result is computed."""
 
 CHOSEN_BY_BLOCK = ("temporal_weight", "spatial_weight", "robust_scale", "noise")
-"""Choices that follow from the points of a block, unless cameras and learned prior determine them."""
+"""Choices that are made from the points of a block, unless cameras and learned prior determine them."""
 
 START_SHARE = 0.07
-"""Share of the time that the starts take from which the weight of bending is computed; measured on 50 × 200,000."""
+"""Share of the run time spent on computing the weight of bending from the blocks' initial shapes; measured on 50 × 200,000."""
 
 
 def needs_blocks(tracks: Tracks, settings: Settings) -> bool:
-    """Return whether the shapes are solved in blocks; a prior on the rank of all points together rules it out."""
+    """Return whether the shapes are solved in blocks; not with a low-rank prior, which couples all points, or the pseudo-inverse."""
     separable = settings.prior != "smooth+low_rank" and settings.method != "pseudo_inverse"
     return separable and tracks.num_frames * tracks.num_points > BLOCK_OBSERVATIONS
 
@@ -73,7 +73,7 @@ def shapes_in_blocks(
     start: Floats | None = None,
     scratch: str | Path | None = None,
 ) -> Solution:
-    """Return the solution of all points; `seconds` are those of the stages so far, `start` and `scratch` as for `solve_shapes`."""
+    """Return the solution of all points; `seconds` is the time per stage so far, `start` and `scratch` are as for `solve_shapes`."""
     began, whole = time.perf_counter(), _Whole(tracks, cameras, prior, scratch)
     groups = blocks(tracks, -(-tracks.num_frames * tracks.num_points // BLOCK_OBSERVATIONS))
     edges = np.zeros((0, 2), dtype=np.int32) if mesh is None else mesh.edges
@@ -114,7 +114,7 @@ def _start_of(
     bending: float | None,
     shapes: Floats | None,
 ) -> Start:
-    """Return the start of some of the points, without gross outliers; at `shapes`, if they are given."""
+    """Return the start of the points of `part`, without gross outliers; at `shapes`, if given."""
     start = prepared(part, cameras, prior, mesh, settings, moving=False, bending=bending, should_stop=monitor)
     start = with_outlier_reason(with_outliers_rejected(start, monitor))
     return start if shapes is None else warm(start, shapes)
@@ -129,9 +129,9 @@ def _bending(
     settings: Settings,
     monitor: Monitor,
 ) -> float | None:
-    """Return λ2 of the whole surface, from the starts of all blocks; None where no block estimates it.
+    """Return λ2 of the whole surface from the initial shapes of all blocks; None if it is not estimated.
 
-    It is the inverse of a mean over the points, to which few sharp features contribute most: a sample of them would not do.
+    λ2 is the inverse of a mean over the points, which a few sharp features dominate, so a sample of the points would not suffice.
     """
     if mesh is None or prior is None or settings.spatial_weight is not None:
         return None
@@ -150,7 +150,7 @@ def _bending(
 
 
 def _changes(cameras: Cameras, prior: Prior | None, monitor: Monitor) -> Changes | None:
-    """Return the changes that every block takes its own from; None without a learned prior."""
+    """Return the jackknife result that all blocks share; None without a learned prior."""
     if prior is None:
         return None
     turning = cameras.observations.turning
@@ -158,10 +158,10 @@ def _changes(cameras: Cameras, prior: Prior | None, monitor: Monitor) -> Changes
 
 
 def blocks(tracks: Tracks, count: int) -> list[NDArray[np.intp]]:
-    """Return the sorted indices of the points of each block, as many in each as in the others but for one.
+    """Return the sorted indices of the points of each block; block sizes differ by at most one.
 
-    The points are divided across the longer side of their mean positions in the picture, then each part again, so that blocks are about as
-    wide as high and have short borders.
+    The points are bisected across the longer side of their mean image positions, recursively, so that blocks are about as wide as high and
+    have short borders.
     """
     total = np.maximum(tracks.visible.sum(axis=0), np.finfo(float).tiny)
     mean = np.einsum("fp,fpc->pc", tracks.visible, tracks.points) / total[:, None]
@@ -178,7 +178,7 @@ def _divided(points: NDArray[np.intp], mean: Floats, count: int) -> list[NDArray
 
 
 def with_margin(own: NDArray[np.intp], edges: Ints, num_points: int) -> NDArray[np.intp]:
-    """Return the points of a block and of `MARGIN` rings of neighbours around it, sorted."""
+    """Return the sorted points of a block and of `MARGIN` rings of neighbours around it."""
     inside = np.zeros(num_points, dtype=bool)
     inside[own] = True
     one, two = edges.T
@@ -189,17 +189,17 @@ def with_margin(own: NDArray[np.intp], edges: Ints, num_points: int) -> NDArray[
 
 
 def _copy(values: Floats, places: NDArray[np.intp], *, onto: Floats, own: NDArray[np.intp]) -> None:
-    """Copy the points `places` to the points `own`, frame by frame: a temporary file takes its time."""
+    """Copy the points `places` to the points `own`, with a pulse per frame: writing to a temporary file is slow."""
     for row, found in zip(onto, values, strict=True):
         pulse()
         row[own] = found[places]
 
 
 def _monitor_of(part: Tracks, settings: Settings, monitor: Monitor, number: int, count: int) -> Monitor:
-    """Return the monitor of one block, whose steps are reported as those of the whole."""
+    """Return a monitor for one block that reports its steps as progress of the whole solve."""
 
     def on_step(step: Step) -> None:
-        if step.stage == "cameras":  # those of all blocks are known
+        if step.stage == "cameras":  # the cameras of all blocks are known
             step = replace(step, stage="initialise")
         if step.stage != "finish" or step.fraction < 1:
             monitor.report_block(step, START_SHARE + (1 - START_SHARE) * (number + step.fraction) / count)
@@ -219,7 +219,7 @@ class _Whole:
         self._parts: list[Solution] = []
 
     def add(self, solution: Solution, own: NDArray[np.intp], places: NDArray[np.intp]) -> None:
-        """Keep what belongs to the block's own points, `places` among those solved."""
+        """Store the results of the block's own points; `places` are their indices among the points solved."""
         _copy(solution.shapes, places, onto=self._shapes, own=own)
         for name in ("residuals", "weights", "shapes_std", "inlier_probability"):
             array = getattr(solution, name)
@@ -267,7 +267,7 @@ class _Whole:
         return replace(solution, choices=self._choices(), trust=self._judged(solution))
 
     def _choices(self) -> Choices:
-        """Return the choices, with medians of those that every block makes for itself, and all warnings."""
+        """Return the choices, with medians of those that each block makes, and the warnings of all blocks."""
         every = [part.choices for part in self._parts]
         values = {name: float(np.median([getattr(each, name) for each in every])) for name in CHOSEN_BY_BLOCK}
         reasons = dict(every[0].reasons)
@@ -279,7 +279,7 @@ class _Whole:
         return replace(every[0], reasons=reasons, warnings=warnings, **values)  # type: ignore[arg-type]
 
     def _judged(self, solution: Solution) -> Trust:
-        """Return the verdict on all points, by `JUDGED_POINTS` of them."""
+        """Return the verdict on all points, computed from at most `JUDGED_POINTS` of them."""
         some = slice(None, None, -(-self._tracks.num_points // JUDGED_POINTS))
         prior, std = self._prior, solution.shapes_std
         held_out = [part.trust.held_out_error for part in self._parts if part.trust is not None]
@@ -299,7 +299,7 @@ class _Whole:
 
 
 def _summed(traces: list[Trace]) -> Trace:
-    """Return the history of all blocks as if they had been solved side by side: a block that has ended keeps its values."""
+    """Return the history of all blocks as if solved in parallel; a block that has ended keeps its last values."""
     longest = max(len(trace.objective) for trace in traces)
 
     def padded(values: Floats | Ints, fill: float | None = None) -> Floats:

@@ -1,4 +1,4 @@
-"""Sentences of a report about the choice between orthography and perspective."""
+"""Report sentences about the choice between orthography and perspective."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from pliant.solver.settings import Settings
 def with_camera_choice(
     choices: Choices, view: Perspective | None, settings: Settings, *, unit: float, given: bool
 ) -> Choices:
-    """Return the choices with the camera model, its reason, the focal lengths compared, and the sign of depth.
+    """Return the choices with camera model, its reason, the focal lengths compared, and whether the sign of depth is known.
 
     Parameters
     ----------
     choices : Choices
-        All others.
+        All other choices.
     view : Perspective, optional
-        What was found; None where perspective was not considered.
+        Estimated perspective; None if perspective was not considered.
     settings : Settings
-        Of the solve.
+        Settings of the solve.
     unit : float
         One normalized unit in the tracks' unit.
     given : bool
-        Whether rotations were given, which settles the sign of depth.
+        Whether rotations were given, which determine the sign of depth.
     """
     plain = settings.camera if settings.camera == "orthographic" else "scaled_orthographic"
     if view is None:
@@ -71,7 +71,7 @@ def described(view: Perspective, unit: float) -> str:
 
 
 def improbable(view: Perspective, unit: float) -> str | None:
-    """Return a warning if a focal length that was given is less probable than another or than orthography."""
+    """Return a warning if the given focal length is less probable than another one or orthography, else None."""
     if view.given is None:
         return None
     nll = {each.curvature: each.nll for each in view.candidates}
@@ -81,6 +81,6 @@ def improbable(view: Perspective, unit: float) -> str | None:
         return None
     other = "orthography" if best == 0 else f"a focal length of {unit / abs(best):.4g}"
     return (
-        f"The focal length given, {unit / view.given:.4g}, is improbable: {other} gains {own - nll[best]:.3f} in the log likelihood per "
+        f"The given focal length, {unit / view.given:.4g}, is improbable: {other} gains {own - nll[best]:.3f} in the log likelihood per "
         "point and frame."
     )

@@ -1,4 +1,4 @@
-"""First stage: the cameras of the tracks."""
+"""First stage: estimate the cameras of the tracks."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ STAGES = (
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Cameras:
-    """Cameras of all frames, and what the following stages need from their estimation."""
+    """Cameras of all frames, with the data that the following stages need."""
 
     camera: Camera
-    """Rotations, scales, translations and lens. `solve_shapes` estimates the translations anew, together with the shapes."""
+    """Rotations, scales, translations and lens. `solve_shapes` re-estimates the translations together with the shapes."""
 
     outliers: float
     """Estimated share of gross outliers among the visible observations."""
 
     reasons: dict[str, str]
-    """One sentence for each choice."""
+    """One sentence for each choice, by name."""
 
     warnings: tuple[str, ...]
     """Reasons to distrust the cameras."""
@@ -56,7 +56,7 @@ class Cameras:
     """Internal: the cameras in normalized units."""
 
     data: LearningData | None
-    """Internal: what the prior is learned from; None unless `settings.prior` is `gaussian`."""
+    """Internal: data for learning the prior; None unless `settings.prior` is `gaussian`."""
 
     observations: Observations
     """Internal: the tracks in normalized units."""
@@ -66,7 +66,7 @@ class Cameras:
         return f"<Cameras of {len(self.camera.rotations)} frames, {lens}>"
 
     def project(self, shapes: Floats) -> Floats:
-        """Return the image of shapes `(F, P, 3)`, shape `(F, P, 2)`, the tracks' unit."""
+        """Return the image, shape `(F, P, 2)`, of shapes `(F, P, 3)`, both in the tracks' unit."""
         return self.camera.project(shapes)
 
 
@@ -80,16 +80,16 @@ def estimate_cameras(
 ) -> Cameras:
     """Estimate the cameras of the tracks: the first stage of `solve`.
 
-    Frames are taken in the order given. `solve` puts photographs in no order (`settings.order`) into an order of their own first.
+    Frames are used in the order given. For unordered photographs (`settings.order`), `solve` sorts the frames by content first.
 
     Parameters
     ----------
     tracks : Tracks
         F frames of P points.
     known : KnownCamera, optional
-        Given cameras: rotations are kept, and what they leave open is estimated.
+        Given cameras: their rotations are kept, and missing parameters are estimated.
     settings : Settings, optional
-        Of the whole reconstruction. With prior `gaussian` the cameras are refined jointly with a covariance of the shapes.
+        Settings of the reconstruction. With prior `gaussian` the cameras are refined jointly with a covariance of the shapes.
     on_step : callable, optional
         Called after units of work.
     should_stop : callable, optional
@@ -98,7 +98,7 @@ def estimate_cameras(
     Raises
     ------
     InvalidInput
-        The given cameras do not fit the tracks, or the tracks show too little.
+        The given cameras do not match the tracks, or too few observations are visible.
     InvalidSettings
         Settings and tracks contradict each other.
     """
@@ -114,10 +114,10 @@ def estimate_cameras(
 
 
 def cameras_of(observations: Observations, monitor: Monitor) -> Cameras:
-    """Return the cameras of the observations; `monitor` counts the units of work."""
+    """Return the cameras of the observations; `monitor` counts units of work and may request a stop."""
     shown, settings = informative_frames(observations.normalized.visible), observations.settings
     long = settings.gaussian and len(shown) > LEARNED_FRAMES
-    # At equal distances, as the priors on motion assume.
+    # Evenly spaced, as the motion priors assume.
     used = np.flatnonzero(shown)[:: -(-int(shown.sum()) // LEARNED_FRAMES)] if long else np.arange(len(shown))
     part = observations.at(used) if long else observations
     estimate = _without_shapes(part, monitor)
@@ -142,10 +142,10 @@ def _without_outliers(
     used: NDArray[np.intp],
     monitor: Monitor,
 ) -> tuple[Observations, CameraEstimate]:
-    """Return the observations in units of their inliers, and the cameras of the frames used without the outliers of the sampled points.
+    """Return the observations normalized by their inliers, and cameras re-estimated without the outliers of the sampled points.
 
-    Completion follows some of the outliers, and the multistart starts from completed tracks. Errors of a walk with 5 % outliers: .13 to
-    .19, and .25 if the multistart is not repeated. Where too little would be left, nothing changes.
+    The multistart starts from completed tracks, in which completion has followed some outliers. Error on a walk with 5 % outliers: .13 to
+    .19, but .25 if the multistart is not repeated. If too few observations would remain, both are returned unchanged.
     """
     seed = observations.settings.seed
     shown = np.flatnonzero(informative_frames(part.normalized.visible))
@@ -165,7 +165,7 @@ def _without_outliers(
 def _with_shapes(
     estimate: CameraEstimate, observations: Observations, monitor: Monitor
 ) -> tuple[CameraEstimate, LearningData | None]:
-    """Return the cameras refined with the shapes, of at most `LEARNED_FRAMES` frames, and what their covariance is learned from."""
+    """Return the cameras refined jointly with the shapes of at most `LEARNED_FRAMES` frames, and the data for the prior."""
     settings, known, normalized = observations.settings, observations.known, observations.normalized
     estimate = replace(estimate, perspective=observations.lens)
     shown = informative_frames(normalized.visible)
@@ -192,7 +192,7 @@ def _with_shapes(
 
 
 def _without_shapes(observations: Observations, monitor: Monitor, rank: int = 0) -> CameraEstimate:
-    """Return cameras estimated without a model of the shapes; `rank` is that of an earlier completion."""
+    """Return cameras estimated without a model of the shapes; `rank` is the rank of an earlier completion, if any."""
     enter(monitor, "completion")
     settings, normalized = observations.settings, observations.normalized
     if observations.known is not None:
@@ -209,7 +209,7 @@ def _without_shapes(observations: Observations, monitor: Monitor, rank: int = 0)
 
 
 def camera_of(estimate: CameraEstimate, observations: Observations) -> Camera:
-    """Return an estimate in the tracks' unit."""
+    """Return the cameras of an estimate in the tracks' unit."""
     normalized, view = observations.normalized, estimate.perspective
     camera = Camera(
         np.array(estimate.rotations, dtype=np.float64),

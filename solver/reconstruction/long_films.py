@@ -1,9 +1,9 @@
-"""Films of more frames than cameras and covariance are learned from together: the rest follows by resection, then all are refined.
+"""Long films: learn from a subset of the frames, add the others by resection, and refine all cameras together.
 
-Cameras and covariance are learned from evenly spread frames. Every frame then gets the camera and the deformation with which the
-points' mean shapes explain it best (`model.resection`), whatever its neighbours look like, and the cameras of all frames are refined
-together by the marginal likelihood. Both are linear in the frames: the likelihood takes the tracks of a sample of points as the factor of
-their Gram matrix, which is never formed.
+Cameras and covariance are learned from evenly spread frames. Resection then gives every frame, independently of its neighbours, the camera
+and deformation with which the points' mean shapes explain it best (`model.resection`). Finally the cameras of all frames are refined
+together by the marginal likelihood. Both steps are linear in the number of frames: the likelihood uses the tracks of a sample of points as
+a factor of their Gram matrix, which is never formed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pliant.solver.refinement.learned import Learned, turned_once
 from pliant.solver.tracks.completion import Filling, gross
 
 PREDICTED_TOGETHER = 256
-"""Frames predicted at once; bounds the memory."""
+"""Maximum number of frames predicted at once, to bound the memory."""
 
 
 def extended(
@@ -43,13 +43,13 @@ def extended(
     Parameters
     ----------
     estimate, covariance
-        Of the frames used, in the same axes.
+        Cameras and prior of the frames used, in the same axes.
     used : array of int, shape (F',)
-        Increasing.
+        Indices of the frames used, increasing.
     observations : Observations
-        Of all F frames.
+        Tracks of all F frames.
     should_stop : callable, optional
-        Called between units of work; once it returns True, what is left is interpolated.
+        Called between units of work; once it returns True, the remaining frames are interpolated.
     """
     enter(should_stop, "extension")
     frames = len(observations.normalized.points)
@@ -83,7 +83,7 @@ def _has_scales(observations: Observations) -> bool:
 
 
 def _views(observations: Observations, estimate: CameraEstimate, chosen: NDArray[np.intp]) -> Views:
-    """Return the tracks of the sampled points, relative to the principal point where perspective is corrected."""
+    """Return the tracks of the sampled points, relative to the principal point if perspective is corrected."""
     normalized, view = observations.normalized, estimate.perspective
     points = normalized.points[:, chosen].transpose(0, 2, 1)
     weight = normalized.visible[:, chosen]
@@ -98,7 +98,7 @@ def _completed(views: Views, shapes: MeanShapes, poses: Poses) -> Floats:
 
 
 def _filled(views: Views, shapes: MeanShapes, poses: Poses, *, as_seen: bool) -> Floats:
-    """Return the sampled tracks with hidden positions and outliers predicted; `as_seen` under perspective, else corrected for it."""
+    """Return the sampled tracks with hidden positions and outliers predicted, corrected for perspective unless `as_seen`."""
     done = []
     std = shapes.variance**0.5
     for low in range(0, len(views.points), PREDICTED_TOGETHER):
@@ -123,7 +123,7 @@ def _whole(
     poses: Poses,
     begun: Floats,
 ) -> tuple[CameraEstimate, LearningData]:
-    """Return the estimate of all frames, the first of them at the identity, and its covariance as learning data."""
+    """Return the estimate of all frames, with an estimated first rotation set to the identity, and its covariance as learning data."""
     size = 1.0 if _has_scales(observations) else float(np.exp(np.log(poses.scales).mean()))
     scales = poses.scales / size
     first = poses.rotations[0] if observations.known is None else np.eye(3)
@@ -139,7 +139,7 @@ def _whole(
     if observations.turning:
         reasons["rotations"] = (
             f"{reasons.get('rotations', '')} These are {len(estimate.rotations)} of {len(rotations)} frames; the others follow by "
-            f"resection, {turn:.2f}° on average from what lies between these, and all are refined together."
+            f"resection, {turn:.2f}° on average from the interpolated rotations, and all are refined together."
         ).strip()
     for array in (rotations, scales):
         read_only(array)
@@ -158,7 +158,7 @@ def _whole(
 
 
 def _of_all_frames(covariance: ShapeCovariance, coefficients: Floats, axes: Floats, size: float) -> ShapeCovariance:
-    """Return the covariance with the coefficients of all frames, in other axes (rows of a rotation) and `size` times as large."""
+    """Return the covariance with the coefficients of all frames, in axes given by the rows of `axes`, scaled by `size`."""
     return replace(
         covariance,
         mean_covariance=size**2 * axes @ covariance.mean_covariance @ axes.T,
@@ -171,7 +171,7 @@ def _of_all_frames(covariance: ShapeCovariance, coefficients: Floats, axes: Floa
 def _filling(
     covariance: ShapeCovariance, rotations: Floats, scales: Floats, poses: Poses, shapes: MeanShapes
 ) -> Filling:
-    """Return the factor that predicts hidden entries of any point: the images of the covariance's columns."""
+    """Return the low-rank factor that predicts hidden entries of any point: the images of the covariance's columns."""
     images = covariance.image_model(rotations[:, :2] * scales[:, None, None]).columns.reshape(len(rotations), 2, -1)
     basis = np.concatenate([images, poses.translations[:, :, None]], axis=2)
     return Filling(basis, np.eye(images.shape[2]), shapes.variance**0.5)

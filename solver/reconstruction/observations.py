@@ -1,4 +1,4 @@
-"""What all stages of a reconstruction start from: checked tracks in normalized units, the lens, and how to monitor a stage."""
+"""Common input of all stages: validated tracks in normalized units, the lens, and the monitor of a stage."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ ShouldStop = Callable[[], bool]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """Tracks and what is given about their cameras."""
+    """Tracks, with the given information about their cameras."""
 
     tracks: Tracks
-    """As given."""
+    """The tracks as given."""
 
     normalized: Normalized
     """The tracks in normalized units."""
 
     settings: Settings
-    """With `order` `film` or `any`."""
+    """Settings with `order` resolved to `film` or `any`."""
 
     lens: Perspective | None
-    """What is given about perspective; None for orthographic camera models."""
+    """Lens under perspective camera models; None under orthographic ones."""
 
     known: KnownCamera | None
-    """Given cameras; None where they are estimated."""
+    """Given cameras; None if they are estimated."""
 
     @property
     def turning(self) -> bool:
@@ -48,23 +48,23 @@ class Observations:
         return self.known is None and self.settings.refine_rotations
 
     def without(self, outliers: NDArray[np.bool_]) -> Observations:
-        """Return the same observations with those where `outliers`, shape `(F, P)`, hidden: they have no part in unit and centroids."""
+        """Return the observations with `outliers`, shape `(F, P)`, hidden, so that they do not affect unit and centroids."""
         kept = normalize(Tracks.from_arrays(self.tracks.points, np.where(outliers, 0.0, self.tracks.visible)))
         return replace(self, normalized=kept, lens=given_lens(self.tracks, kept, self.settings, self.known))
 
     def with_all(self) -> Observations:
-        """Return the observations with those that were hidden, in the same unit and about the same centroids."""
+        """Return all observations, including those hidden by `without`, in the same unit and about the same centroids."""
         return replace(self, normalized=in_units_of(self.normalized, self.tracks))
 
     def without_points(self) -> Observations:
-        """Return what the same tracks, or others of their frames, are normalized with, without the points themselves."""
+        """Return a copy without the normalized points, which still serves `of` for other tracks of the same frames."""
         frames = self.tracks.num_frames
         return replace(
             self, normalized=replace(self.normalized, points=np.zeros((frames, 0, 2)), visible=np.zeros((frames, 0)))
         )
 
     def at(self, used: NDArray[np.intp]) -> Observations:
-        """Return some of the frames, in the unit of all."""
+        """Return the observations of the frames `used`, in the unit of all frames."""
         tracks = Tracks.from_arrays(self.tracks.points[used], self.tracks.visible[used])
         whole = self.normalized
         normalized = replace(
@@ -78,7 +78,7 @@ class Observations:
         return Observations(tracks, normalized, self.settings, lens, known)
 
     def of(self, tracks: Tracks) -> Observations:
-        """Return other tracks of the same frames, in the unit and about the centroids of these.
+        """Return observations of other tracks of the same frames, in this unit and about these centroids.
 
         Raises
         ------
@@ -89,14 +89,14 @@ class Observations:
             return self
         if tracks.num_frames != self.tracks.num_frames:
             raise InvalidInput(
-                "camera_mismatch", field="cameras", expected=f"cameras of {tracks.num_frames} frames, as the tracks",
+                "camera_mismatch", field="cameras", expected=f"cameras of {tracks.num_frames} frames, as many as the tracks have",
                 got=f"{self.tracks.num_frames}", hint="Estimate the cameras from tracks of the same frames.",
             )  # fmt: skip
         return replace(self, tracks=tracks, normalized=in_units_of(self.normalized, tracks))
 
 
 def in_units_of(normalized: Normalized, tracks: Tracks) -> Normalized:
-    """Return tracks in the unit and about the centroids of others."""
+    """Return tracks in the unit and about the centroids of `normalized`."""
     points = np.zeros(tracks.points.shape)
     for some in frame_chunks(tracks.num_frames, tracks.num_points):
         placed = (tracks.points[some] - normalized.centroid[some, None]) / normalized.unit
@@ -105,26 +105,26 @@ def in_units_of(normalized: Normalized, tracks: Tracks) -> Normalized:
 
 
 def observe(tracks: Tracks, known: KnownCamera | None, settings: Settings) -> Observations:
-    """Return the tracks in normalized units, with their lens; `settings.order` is `film` or `any`.
+    """Return the tracks in normalized units, with their lens; `settings.order` must be `film` or `any`.
 
     Raises
     ------
     InvalidInput
-        The tracks show nothing, or contradict the lens.
+        No observation is visible, or the tracks contradict the lens.
     """
     normalized = normalize(tracks)
     return Observations(tracks, normalized, settings, given_lens(tracks, normalized, settings, known), known)
 
 
 def check_fit(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None, settings: Settings) -> None:
-    """Check that mesh and given cameras fit the tracks, and the settings the mesh.
+    """Check that mesh and given cameras match the tracks, and the settings the mesh.
 
     Raises
     ------
     InvalidInput
-        Codes mesh_mismatch and camera_mismatch.
+        Number of vertices (code `mesh_mismatch`) or of cameras (`camera_mismatch`).
     InvalidSettings
-        `laplacian="grid8"` with faces only.
+        `laplacian="grid8"` with a mesh that is not a grid.
     """
     if mesh is not None and mesh.num_points != tracks.num_points:
         raise InvalidInput(
@@ -139,7 +139,7 @@ def check_fit(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None, se
     if cameras is not None and len(cameras.rotations) != tracks.num_frames:
         raise InvalidInput(
             "camera_mismatch", field="rotations", expected=f"{tracks.num_frames} rotations, one for each frame of the tracks",
-            got=f"{len(cameras.rotations)}", hint="Give one camera a frame, in the order of the frames.",
+            got=f"{len(cameras.rotations)}", hint="Pass one camera per frame, in the order of the frames.",
         )  # fmt: skip
 
 
@@ -153,7 +153,7 @@ def monitored(
     sheet: bool = False,
     only: Collection[str] = (),
 ) -> Monitor:
-    """Return the monitor of a solve, or of the stages named by `only`."""
+    """Return the monitor of a whole solve, or of the stages named in `only`."""
     unseen = 0.0 if tracks.all_visible else unseen_frames(tracks.visible)
     plan = planned(
         tracks.num_frames, tracks.num_points, gaussian=settings.gaussian, known_cameras=known is not None,

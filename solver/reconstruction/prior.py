@@ -1,4 +1,4 @@
-"""Second stage: the prior of the shapes, learned from the tracks and their cameras."""
+"""Second stage: learn the prior of the shapes from the tracks and their cameras."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from pliant.solver.refinement.depth_rounds import with_depth_map
 class Prior:
     """A Gaussian over the path of a point through all frames: x_p ~ N(0, 1 1ᵀ ⊗ A₀ + C ⊗ A₁).
 
-    A₀ (3×3) is the covariance of a point's mean position, A₁ (3×3, trace 3) that of its deformation over the axes, and
-    C = L Lᵀ + τ T over the frames, with modes L (F×k) and a random walk T. World axes, the tracks' unit, about each frame's centroid.
+    A₀ (3×3) is the covariance of a point's mean position. A₁ (3×3, trace 3) is the covariance of its deformation over the axes, and
+    C = L Lᵀ + τ T over the frames, with modes L (F×k) and a random walk T. World axes, relative to each frame's centroid.
     """
 
     unit: float
     """The tracks' unit per normalized unit."""
 
     reason: str
-    """A sentence about the modes."""
+    """One sentence on the choice of the modes."""
 
     stopped: bool
     """Whether a stop was requested; the prior is then the best so far."""
@@ -39,7 +39,7 @@ class Prior:
     """Internal: the covariance in normalized units."""
 
     estimate: CameraEstimate
-    """Internal: the cameras that it was learned with."""
+    """Internal: the cameras that the prior was learned with."""
 
     def __repr__(self) -> str:
         frames, modes = self.normalized.modes.shape
@@ -47,7 +47,7 @@ class Prior:
 
     @property
     def mean_covariance(self) -> Floats:
-        """A₀, shape `(3, 3)`, the tracks' unit squared."""
+        """A₀, shape `(3, 3)`, in squared units of the tracks."""
         return np.asarray(self.normalized.mean_covariance * self.unit**2)
 
     @property
@@ -57,22 +57,22 @@ class Prior:
 
     @property
     def modes(self) -> Floats:
-        """L, shape `(F, k)`, the tracks' unit: standard deviation of the deformation that each mode explains, by frame."""
+        """L, shape `(F, k)`, in the tracks' unit: standard deviation per frame of the deformation that each mode explains."""
         return np.asarray(self.normalized.modes * self.unit)
 
     @property
     def walk_variance(self) -> float:
-        """τ, the tracks' unit squared."""
+        """τ, in squared units of the tracks."""
         return float(self.normalized.walk_variance * self.unit**2)
 
     @property
     def covariance(self) -> Floats:
-        """C, shape `(F, F)`, the tracks' unit squared."""
+        """C, shape `(F, F)`, in squared units of the tracks."""
         return np.asarray(self.normalized.over_frames() * self.unit**2)
 
     @property
     def noise_std(self) -> float:
-        """σ, standard deviation of an image coordinate that the shapes are solved with, the tracks' unit."""
+        """σ, noise standard deviation of an image coordinate used to solve for the shapes, in the tracks' unit."""
         return noise_std(self.normalized) * self.unit
 
 
@@ -91,9 +91,9 @@ def learn_prior(
     tracks : Tracks
         F frames of P points.
     cameras : Cameras
-        Of these tracks; they are not changed. For given cameras call `estimate_cameras(tracks, known)`.
+        Cameras estimated from these tracks; they are not changed. For given cameras call `estimate_cameras(tracks, known)`.
     seed : int, optional
-        Of the split of the points where some are held out; None takes that of the cameras' settings.
+        Seed of the random choice of held-out points; None uses the seed in the cameras' settings.
     on_step : callable, optional
         Called after units of work.
     should_stop : callable, optional
@@ -102,7 +102,7 @@ def learn_prior(
     Raises
     ------
     InvalidInput
-        The cameras are not those of these tracks.
+        The cameras were estimated from other tracks.
     """
     given = cameras.observations.tracks
     if given is not tracks and not (
@@ -125,7 +125,7 @@ def learn_prior(
 
 
 def _with_learning_data(tracks: Tracks, cameras: Cameras, should_stop: ShouldStop | None) -> Cameras:
-    """Return the same cameras with what the prior is learned from, which estimates for other priors lack."""
+    """Return the cameras with the data for learning the prior, which estimates for other priors lack."""
     settings = replace(
         cameras.observations.settings, method="robust", preset="auto", prior="gaussian", focal=None, field_of_view=None
     )
@@ -136,7 +136,7 @@ def _with_learning_data(tracks: Tracks, cameras: Cameras, should_stop: ShouldSto
 
 
 def prior_of(cameras: Cameras, monitor: Monitor, *, seed: int) -> Prior:
-    """Return the prior that belongs to the cameras, which have their learning data."""
+    """Return the prior of cameras that have their learning data."""
     assert cameras.data is not None
     estimate, covariance = learn_covariance(cameras.estimate, cameras.data, seed=seed, should_stop=monitor)
     unit = cameras.observations.normalized.unit
@@ -144,7 +144,7 @@ def prior_of(cameras: Cameras, monitor: Monitor, *, seed: int) -> Prior:
 
 
 def estimate_with(cameras: Cameras, prior: Prior) -> CameraEstimate:
-    """Return the cameras with the depths that follow from the prior, for the correction of perspective."""
+    """Return the cameras with the depth map of the prior, for the correction of perspective."""
     if prior.estimate.rotations is cameras.estimate.rotations:
         return prior.estimate
     reasons = {**cameras.estimate.reasons, "modes": prior.reason}

@@ -1,4 +1,4 @@
-"""Third stage: the shapes, by iteratively reweighted least squares."""
+"""Third stage: solve for the shapes by iteratively reweighted least squares."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from pliant.solver.solution import Outcome, Solution
 from pliant.solver.tracks.noise import OUTLIER_SHARE
 
 DEPTH_ROUNDS, DEPTH_SETTLED = 4, 1e-4
-"""Maximum number of corrections of the tracks by the depths of the shapes, and the RMS change of the corrected
-tracks, normalized units, below which they end."""
+"""Maximum number of corrections of the tracks with the depths of the shapes, and the RMS change of the corrected tracks,
+normalized units, below which they end."""
 
 
 def shapes_from(
     start: Start, monitor: Monitor, *, seconds: dict[str, float], changes: Changes | None = None
 ) -> Solution:
-    """Return the solution that a start leads to; `seconds` are those of the stages so far, `changes` as for `assessed`."""
+    """Return the solution computed from a start; `seconds` is the time per stage so far, `changes` is as for `assessed`."""
     monitor.report(_step_of("initialise", start.state, start))
     began = time.perf_counter()
-    history, start = [start.state], replace(start, state=start.state.summary())  # no step keeps the arrays of the first
+    history, start = [start.state], replace(start, state=start.state.summary())  # so that no step keeps its arrays
     start, history, outcome = _minimised(start, history, monitor)
     start, history[-1] = _with_the_rest(start, history[-1])
     seconds = {**seconds, "shapes": time.perf_counter() - began}
@@ -44,7 +44,7 @@ def shapes_from(
 
 
 def _minimised(start: Start, history: list[State], monitor: Monitor) -> tuple[Start, list[State], Outcome]:
-    """Return the start with its tracks corrected for perspective by the shapes found, the history, and how it ended."""
+    """Return the start, its tracks corrected for perspective with the depths of the shapes, the history, and the outcome."""
     view = start.estimate.perspective
     corrections = DEPTH_ROUNDS if view is not None and view.bends else 0
     monitor.expect_corrections(corrections)
@@ -85,7 +85,7 @@ def _loop(start: Start, history: list[State], monitor: Monitor) -> tuple[list[St
 
 
 def _with_the_rest(start: Start, state: State) -> tuple[Start, State]:
-    """Return problem, choices and state of all points, given those of the well-observed points."""
+    """Return start and state of all points, given those of the well-observed points."""
     part, covariance = start.part, start.covariance
     if part is None or covariance is None:
         return start, state
@@ -106,7 +106,7 @@ def _with_the_rest(start: Start, state: State) -> tuple[Start, State]:
 def _finished(
     start: Start, history: list[State], outcome: Outcome, monitor: Monitor, changes: Changes | None
 ) -> Solution:
-    """Return the solution in the tracks' unit, with its standard deviations, probabilities and verdict."""
+    """Return the solution in the tracks' unit, with standard deviations, inlier probabilities and verdict."""
     observations, estimate, problem = start.observations, start.estimate, start.problem
     tracks, normalized = observations.tracks, observations.normalized
     outcome = Outcome.STOPPED if monitor() else outcome
@@ -125,7 +125,7 @@ def _finished(
         solution, tracks, confidence, full_confidence=normalized.full_confidence, loss=problem.loss, should_stop=monitor
     )
     monitor.enter("trust")
-    # Without its weight the prior is not that of the shapes, and says nothing about their errors.
+    # With weight 0 the prior was not used for the shapes, so it does not describe their errors.
     covariance = start.covariance if problem.weights.temporal > 0 else None
     solution = assessed(
         solution, tracks, confidence, estimate, covariance, normalized.unit,

@@ -1,4 +1,4 @@
-"""A solution in the tracks' unit from the last state of a minimisation."""
+"""Conversion of the last state of a minimisation to a solution in the tracks' unit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def finish(
     estimate: CameraEstimate,
     choices: Choices,
 ) -> Solution:
-    """Turn the last state into a Solution in the tracks' unit, with orthographic cameras."""
+    """Convert the last state to a Solution in the tracks' unit, with orthographic cameras."""
     state, unit = history[-1], normalized.unit
     top = largest_weight(problem.loss, problem.weights.robust_scale)
     frames, _, points = state.shapes.shape

@@ -1,4 +1,4 @@
-"""The public form of the third stage: shapes of given cameras and prior, at once or in blocks of points."""
+"""Public interface of the third stage: shapes for given cameras and prior, at once or in blocks of points."""
 
 from __future__ import annotations
 
@@ -40,35 +40,35 @@ def solve_shapes(
 ) -> Solution:
     """Solve for the shape of every frame: the last stage of `solve`.
 
-    Gross outliers are left out. More than `limits.BLOCK_OBSERVATIONS` are solved in blocks of points, as by `solve`.
+    Gross outliers are rejected. More than `limits.BLOCK_OBSERVATIONS` frames times points are solved in blocks of points.
 
     Parameters
     ----------
     tracks : Tracks
-        Of the cameras' frames; the points may be others than those that the cameras were estimated from.
+        Tracks over the frames of the cameras; the cameras may have been estimated from other points.
     cameras : Cameras
         From `estimate_cameras`.
     prior : Prior, optional
-        From `learn_prior`; None: smoothness in time, or the prior of `settings` if that is not `gaussian`.
+        From `learn_prior`. None uses the prior of `settings`, or smoothness in time if that is `gaussian`.
     mesh : Mesh, optional
-        Which points are neighbours.
+        Which points are neighbours; None for no smoothness in space.
     settings : Settings, optional
-        Method, loss, weights; None takes those of the cameras.
+        Method, loss, weights; None uses the settings of the cameras.
     start : Solution or ndarray, shape (F, P, 3), optional
-        Shapes to start from, world axes, the tracks' unit; None starts from least squares. The energy is the same either way.
+        Initial shapes, world axes, the tracks' unit; None starts from least squares. The energy is the same either way.
     scratch : path, optional
-        Folder for a temporary file that holds the result of blocks, as for `solve`.
+        Folder for a temporary file that holds the result if the shapes are solved in blocks, as for `solve`.
     on_step : callable, optional
-        Called as the solve proceeds, as a rule at least every half second.
+        Called as the solve proceeds, usually at least every half second.
     should_stop : callable, optional
         Called between units of work; once it returns True, the solve ends with `Outcome.STOPPED` and the last shapes.
 
     Raises
     ------
     InvalidInput
-        Mesh, cameras, prior or start do not fit the tracks.
+        Mesh, cameras, prior or start do not match the tracks.
     InvalidSettings
-        The settings are those of another prior than the given one, or need a mesh.
+        The settings select another prior than the given one, or require a mesh that is a grid.
     NotFinite
         The arithmetic overflowed.
     OSError
@@ -93,5 +93,5 @@ def solve_shapes(
         if first is not None:
             begun = warm(begun, first)
         seconds, starts = {"initialise": time.perf_counter() - began}, [begun]
-        del begun, first  # `shapes_from` has the only reference, and lets go of the first state
+        del begun, first  # so that `shapes_from` has the only reference and can release the first state
         return shapes_from(starts.pop(), monitor, seconds=seconds)

@@ -1,4 +1,4 @@
-"""The start of the shapes: the problem, least-squares shapes, and the rejection of gross outliers."""
+"""Initialisation of the third stage: the problem, least-squares shapes, and the rejection of gross outliers."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from pliant.solver.tracks.normalization import Normalized
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:
-    """Start of the minimisation."""
+    """Problem and initial state of the minimisation."""
 
     observations: Observations
     mesh: Mesh | None
     settings: Settings
 
     flat: Normalized
-    """The tracks corrected for perspective; the tracks themselves for orthographic cameras."""
+    """The tracks corrected for perspective; the normalized tracks under orthographic cameras."""
 
     estimate: CameraEstimate
     covariance: ShapeCovariance | None
@@ -55,7 +55,7 @@ class Start:
 
     @property
     def kept(self) -> NDArray[np.intp] | None:
-        """Points of the problem; None for all."""
+        """Indices of the points of the problem; None for all points."""
         return None if self.part is None else self.part.kept
 
     def confidence(self) -> Floats:
@@ -66,7 +66,7 @@ class Start:
         return visible
 
     def rejected(self) -> NDArray[np.bool_]:
-        """Return the observations that are not used, shape `(F, P)`."""
+        """Return the visible observations that are not used, shape `(F, P)`."""
         return np.asarray((self.observations.tracks.visible > 0) & (self.confidence() == 0))
 
 
@@ -80,9 +80,9 @@ def find_outliers(
     on_step: OnStep | None = None,
     should_stop: ShouldStop | None = None,
 ) -> NDArray[np.bool_]:
-    """Find the observations that are gross outliers: those that the others of their point make less probable than an outlier.
+    """Find the gross outliers, which `solve_shapes` rejects: observations more probably outliers than not.
 
-    `solve_shapes` leaves them out.
+    The probability is computed from the cameras, the prior and the other observations of the point.
 
     Parameters
     ----------
@@ -91,12 +91,12 @@ def find_outliers(
     on_step : callable, optional
         Called after units of work.
     should_stop : callable, optional
-        Called between units of work; once it returns True, nothing is rejected.
+        Called between units of work; once it returns True, the outliers found so far are returned.
 
     Returns
     -------
     ndarray of bool, shape (F, P)
-        All False where the share of outliers that the cameras were estimated with, `cameras.outliers`, is 0.5 % or less.
+        All False if the estimated share of outliers, `cameras.outliers`, is 0.5 % or less.
     """
     used = cameras.observations.settings if settings is None else settings
     monitor = monitored(tracks, None, used, on_step, should_stop, only=("shapes",))
@@ -118,16 +118,16 @@ def prepared(
     bending: float | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Start:
-    """Return the start of the minimisation, with nothing rejected; once `should_stop` returns True, shapes that are less converged.
+    """Return the start of the minimisation, before outlier rejection; less converged once `should_stop` returns True.
 
-    `moving` as in `Problem`; `bending` is λ2 where the settings leave it automatic, None: from the first shapes.
+    `moving` is as in `Problem`; `bending` is λ2 if automatic in the settings, None to compute it from the initial shapes.
 
     Raises
     ------
     InvalidInput
-        Mesh or cameras do not fit the tracks.
+        Mesh, cameras or prior do not match the tracks.
     InvalidSettings
-        A learned prior beside settings of another one.
+        The settings select another prior than the given one.
     """
     observations = cameras.observations.of(tracks)
     settings = observations.settings if settings is None else settings
@@ -139,7 +139,7 @@ def prepared(
         estimate, covariance = estimate_with(cameras, prior), prior.normalized
     else:
         raise InvalidSettings(
-            "invalid_option", field="settings.prior", expected="gaussian, with method robust and preset auto, beside a learned prior",
+            "invalid_option", field="settings.prior", expected="gaussian, with method robust and preset auto, with a learned prior",
             got=f"prior {settings.prior}, method {settings.method}, preset {settings.preset}",
             hint="Pass prior=None for the priors that are not learned.",
         )  # fmt: skip
@@ -147,7 +147,7 @@ def prepared(
         covariance is not None and len(covariance.modes) != tracks.num_frames
     ):
         raise InvalidInput(
-            "camera_mismatch", field="prior", expected=f"a prior of {tracks.num_frames} frames, as the tracks",
+            "camera_mismatch", field="prior", expected=f"a prior of {tracks.num_frames} frames, as many as the tracks have",
             got=f"{0 if covariance is None else len(covariance.modes)}", hint="Learn the prior from tracks of the same frames.",
         )  # fmt: skip
     flat = orthographic(observations.normalized, estimate.perspective)
@@ -195,12 +195,12 @@ def _initial(problem: Problem, estimate: CameraEstimate, settings: Settings, sho
 
 
 def warm(start: Start, shapes: Floats) -> Start:
-    """Return the start at given shapes.
+    """Return the start with its state at given shapes `(F, P, 3)`, world axes, the tracks' unit.
 
     Raises
     ------
     InvalidInput
-        They have another shape, or are not finite.
+        The array has the wrong shape or contains values that are not finite.
     """
     check_shapes(shapes, start.observations.tracks)
     part = shapes if start.kept is None else shapes[:, start.kept]
@@ -211,12 +211,12 @@ def warm(start: Start, shapes: Floats) -> Start:
 
 
 def check_shapes(shapes: Floats, tracks: Tracks) -> None:
-    """Check that shapes to start from fit the tracks.
+    """Check that initial shapes match the tracks.
 
     Raises
     ------
     InvalidInput
-        They have another shape, or are not finite.
+        The array has the wrong shape or contains values that are not finite.
     """
     expected = (*tracks.visible.shape, 3)
     if shapes.shape != expected or not np.isfinite(shapes).all():
@@ -227,12 +227,12 @@ def check_shapes(shapes: Floats, tracks: Tracks) -> None:
 
 
 def without_learned_prior(settings: Settings) -> Settings:
-    """Return settings with smoothness in time in place of a learned prior."""
+    """Return the settings with smoothness in time instead of the Gaussian prior."""
     return replace(settings, prior="smooth", order="film") if settings.gaussian else settings
 
 
 def with_outliers_rejected(start: Start, monitor: Monitor) -> Start:
-    """Return the start without gross outliers, where there are any and a learned prior tells them."""
+    """Return the start without gross outliers; unchanged without a learned prior or with hardly any outliers."""
     problem, covariance, filling = start.problem, start.covariance, start.estimate.filling
     if covariance is None or filling is None or problem.weights.temporal == 0 or start.outliers <= OUTLIER_SHARE:
         return start
@@ -247,7 +247,7 @@ def with_outliers_rejected(start: Start, monitor: Monitor) -> Start:
 
 
 def with_outlier_reason(start: Start) -> Start:
-    """Return the start with a sentence about the share of rejected observations, where outliers were looked for."""
+    """Return the start with a sentence on the share of rejected observations, if outliers were searched for."""
     outliers = start.outliers
     if start.covariance is None or start.problem.weights.temporal == 0 or outliers <= OUTLIER_SHARE:
         return start
@@ -257,5 +257,5 @@ def with_outlier_reason(start: Start) -> Start:
 
 
 def outlier_reason(rejected: int, seen: int, expected: float) -> str:
-    """Return a sentence about the number of rejected observations, of those seen, and the expected share."""
+    """Return a sentence on the rejected share of the visible observations and the expected share."""
     return f"{rejected / seen:.1%} of the visible observations are rejected as gross outliers; {expected:.1%} were expected."

@@ -1,4 +1,4 @@
-"""Isometric surfaces: whether the tracks show one, which replaces the stages of a free surface."""
+"""Isometric surfaces: test whether the tracks show one, whose solution then replaces the stages of a free surface."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def tries_isometry(cameras: KnownCamera | None, settings: Settings) -> bool:
     """Whether the tracks are tested for an isometric surface."""
     if settings.surface != "auto":
         return settings.surface == "isometric"
-    # Without image size or focal length, I has false minima on cloth seen from afar.
+    # Without image size or focal length, the inconsistency I has false minima for cloth at a large distance.
     pinhole = settings.focal_length is not None or settings.image_size is not None
     return settings.gaussian and pinhole and cameras is None and settings.camera in {Settings().camera, "perspective"}
 
@@ -29,17 +29,17 @@ def tries_isometry(cameras: KnownCamera | None, settings: Settings) -> bool:
 def isometric_verdict(
     tracks: Tracks, cameras: KnownCamera | None, settings: Settings, monitor: Monitor
 ) -> IsometricVerdict | None:
-    """Return whether the surface is isometric; None where this is not tested.
+    """Return the verdict on whether the surface is isometric; None if this is not tested.
 
     Raises
     ------
     InvalidSettings
-        An isometric surface is required beside given rotations.
+        An isometric surface is required, but rotations are given.
     """
     if settings.surface == "isometric" and cameras is not None:
         raise InvalidSettings(
             "invalid_option", field="options.surface", expected="auto or free where rotations are given", got="'isometric'",
-            hint="Leave the rotations out: an isometric surface gives its own cameras.",
+            hint="Omit the rotations: an isometric surface determines its own cameras.",
         )  # fmt: skip
     if not tries_isometry(cameras, settings):
         return None
@@ -52,7 +52,7 @@ def isometric_verdict(
 def solution_of(
     tracks: Tracks, verdict: IsometricVerdict, settings: Settings, monitor: Monitor, *, began: float
 ) -> Solution:
-    """Return the solution of an accepted verdict; `began` is the clock at the start of the solve."""
+    """Return the solution of an accepted verdict; `began` is the `time.perf_counter` value at the start of the solve."""
     normalized, seconds = normalize(tracks), {"cameras": time.perf_counter() - began}
     solution = isometric_solution(
         tracks, verdict, settings, unit=normalized.unit, seconds=seconds, stopped=monitor.stopped
@@ -63,10 +63,10 @@ def solution_of(
 
 
 def with_verdict(choices: Choices, verdict: IsometricVerdict, settings: Settings) -> Choices:
-    """Return the choices with the reason for a free surface, and a warning if an isometric one was required."""
+    """Return the choices with the reason for a free surface, and a warning if an isometric surface was required."""
     warnings = choices.warnings
     if settings.surface == "isometric":
-        warnings = (*warnings, f"The surface could not be taken as isometric and is free. {verdict.reason}")
+        warnings = (*warnings, f"The surface was not accepted as isometric and is solved as free. {verdict.reason}")
     tried = tuple((each.focal, each.inconsistency) for each in verdict.candidates)
     return replace(
         choices, reasons={**choices.reasons, "surface": verdict.reason}, warnings=warnings, focal_lengths=tried

@@ -1,16 +1,16 @@
-"""How deep the object is, where the cameras hardly turn: one step along the bas-relief family, with a prior on the extent of depth.
+"""Extent of depth where the cameras hardly rotate: one step along the bas-relief family, with a prior on the depth.
 
-A deep object that hardly turns and a flat one that turns more look alike (the bas-relief ambiguity; Belhumeur, Kriegman and Yuille
-1999). Let d be the mean optical axis in world axes. Depth along d times λ and rotations off d divided by λ change the images only in
-the second order of the angles. Where these are a few degrees the likelihood hardly changes with λ, and the prior on camera motion, which
-rewards a smaller variance of the motion without end (`model.camera_motion_prior`), prefers no rotation and unlimited depth. Refinement
-creeps along this curved valley; here λ alone is changed, to where
+A deep object that rotates little and a flat one that rotates more look alike (the bas-relief ambiguity; Belhumeur, Kriegman and Yuille
+1999). Let d be the mean optical axis in world axes. Multiplying depth along d by λ and dividing rotations off d by λ changes the images
+only to second order in the angles. For angles of a few degrees the likelihood hardly depends on λ, and the camera-motion prior, which
+rewards less variance of the motion down to a small floor (`model.camera_motion_prior`), favours too little rotation and too much depth.
+Refinement is slow along this curved valley; here λ alone is changed, to minimise
 
-    E(λ) + weight · (3/2 log((2 + x) / 3) − 1/2 log x),    x = a λ² / (b r²)
+    E(λ) + weight · (3/2 log((2 + x) / 3) − 1/2 log x),    x = a λ² / (b r²).
 
-is least. E is the negative log likelihood without the prior on camera motion, a the variance of the positions along d, and b that across.
+E is the negative log likelihood without the camera-motion prior, a the variance of the positions along d, b the mean of those across.
 The penalty is the negative log density of log x for x with an F distribution of 1 and 2 degrees of freedom, the ratio of a variance along
-one axis to one along two. It has no unit and grows as 2 log λ and log 1/λ. Where the object turns by tens of degrees, E decides and
+one axis to one along two. It is dimensionless and grows as 2 log λ and log 1/λ. If the object rotates by tens of degrees, E dominates and
 λ is 1 to within a fraction of a percent.
 """
 
@@ -26,14 +26,14 @@ from pliant.solver.refinement.learned import Learned, motion_of, scene_at
 from scipy.optimize import minimize_scalar
 
 VISIBLE_DEPTH = (1 / 2 - 4 / 9) ** 0.5 / 0.5
-"""r, standard deviation of depth over that of x or y: .47 for the half of a sphere that faces the camera, in points evenly spread over
-the picture (z² has the mean 1/2, z 2/3, x² 1/4)."""
+"""r, standard deviation of depth over that of x or y: .47 for the half of a sphere that faces the camera, with points evenly spread over
+the picture (the means of z², z and x² are 1/2, 2/3 and 1/4)."""
 
 MAX_STRETCH = 30.0
 """Bound on λ and 1/λ."""
 
 DECIDED = 1.25
-"""λ or 1/λ below which the depth counts as decided by the tracks."""
+"""λ or 1/λ below which the depth counts as determined by the tracks."""
 
 MAX_ANGLE = np.radians(60.0)
 """Angle from d, rad, that no frame may exceed after the step: bas-relief is an approximation for small angles."""
@@ -45,9 +45,9 @@ def settled_depth(gram: Floats, found: Learned) -> tuple[Learned, float]:
     Parameters
     ----------
     gram : array, shape (2F, 2F)
-        Of the tracks that `found` belongs to.
+        W Wᵀ / P of the tracks from which `found` was estimated.
     found : Learned
-        Cameras, orthographic up to scale, and covariance.
+        Scaled-orthographic cameras, and covariance.
     """
     toward, rolls, tilts = _decomposed(found.rotations)
     largest = float(np.linalg.norm(tilts, axis=1).max())
@@ -67,7 +67,7 @@ def settled_depth(gram: Floats, found: Learned) -> tuple[Learned, float]:
             depth / expected * float(np.exp(2 * log_stretch))
         )
 
-    # Several starts: far from its minimum the likelihood is flat.
+    # A grid search first: the likelihood is flat far from its minimum.
     grid = np.linspace(least, np.log(MAX_STRETCH), 25)
     costs = [cost(float(each)) for each in grid]
     best = int(np.argmin(costs))
@@ -80,16 +80,16 @@ def settled_depth(gram: Floats, found: Learned) -> tuple[Learned, float]:
 
 
 def bulges(found: Learned, sample: Floats, *, y_up: bool) -> bool:
-    """Whether the middle of the rigid shape is nearer to the camera than its rim, as that of half a sphere that one sees.
+    """Whether the rigid shape bulges towards the camera: its middle is nearer than its rim, as for the visible half of a sphere.
 
-    Orthographic images are those of the mirror image in depth as well; surfaces that one sees from in front bulge more often than not.
+    Orthography does not distinguish a shape from its mirror image in depth; surfaces seen from the front mostly bulge.
 
     Parameters
     ----------
     found : Learned
-        Cameras, orthographic up to scale, and covariance.
+        Scaled-orthographic cameras, and covariance.
     sample : array, shape (F, S, 2)
-        Tracks of some points that they belong to, centred.
+        Centred tracks of sampled points.
     y_up : bool
         Whether y points up in the images, and z therefore toward the camera.
     """
@@ -104,12 +104,12 @@ def bulges(found: Learned, sample: Floats, *, y_up: bool) -> bool:
 
 
 def extent_penalty(ratio: float) -> float:
-    """Return the negative log density of log x at x = `ratio` > 0, 0 at its least."""
+    """Return the negative log density of log x at x = `ratio` > 0, shifted to a minimum of 0."""
     return 1.5 * float(np.log((2 + ratio) / 3)) - 0.5 * float(np.log(ratio))
 
 
 def _decomposed(rotations: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return d (3,), rotations (F, 3, 3) about the optical axis, and the rotation vectors (F, 3) before them, orthogonal to d."""
+    """Return d (3,), rolls (F, 3, 3) about the optical axis, and the tilts applied before them, rotation vectors (F, 3) orthogonal to d."""
     axes = rotations[:, 2]
     mean = axes.sum(axis=0)
     toward = mean / max(float(np.linalg.norm(mean)), np.finfo(float).tiny)
@@ -121,7 +121,7 @@ def _decomposed(rotations: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _stretched(found: Learned, stretch: float, toward: Floats, rolls: Floats, tilts: Floats) -> Learned:
-    """Return cameras and covariance with depth along d times λ and tilts divided by it."""
+    """Return cameras and covariance with depth along d multiplied and tilts divided by λ."""
     along = np.eye(3) + (stretch - 1) * np.outer(toward, toward)
     covariance = found.covariance
     deformation = along @ covariance.axis_covariance @ along.T
@@ -137,7 +137,7 @@ def _stretched(found: Learned, stretch: float, toward: Floats, rolls: Floats, ti
 
 
 def _spread(found: Learned) -> Floats:
-    """Return the variance of the positions over points, mean over frames, shape `(3, 3)`."""
+    """Return the covariance of the positions over points, averaged over frames, shape `(3, 3)`."""
     covariance = found.covariance
     moving = float((covariance.modes**2).sum()) / len(covariance.modes) + covariance.walk_variance
     return np.asarray(covariance.mean_covariance + moving * covariance.axis_covariance)

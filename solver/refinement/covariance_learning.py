@@ -18,10 +18,10 @@ from pliant.solver.refinement.depth_rounds import with_depth_map
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearningData:
-    """What the shape covariance is learned from, once the cameras are final."""
+    """Data from which the shape covariance is learned, once the cameras are final."""
 
     gram: Floats
-    """Gram matrix of the frames used, divided by the scales of the start, shape `(2F', 2F')`."""
+    """Gram matrix of the frames used, divided by the starting scales, shape `(2F', 2F')`."""
 
     sample: Floats
     """Sampled points, divided by the same scales, shape `(F', S, 2)`."""
@@ -35,13 +35,13 @@ class LearningData:
     model_order: ModelOrder
 
     stopped: ShapeCovariance | None
-    """Covariance of a refinement that was stopped, to be taken as it is; None where one is to be learned."""
+    """Covariance of an interrupted refinement, used unchanged; None to learn one."""
 
     rotations: Floats
     """Cameras of all frames in the axes of `projections`, shape `(F, 3, 3)`."""
 
     scales: Floats
-    """Their scales, shape `(F,)`."""
+    """Scales of all frames, shape `(F,)`."""
 
     turned: bool
     """Whether the world axes of the estimate are those of its first camera."""
@@ -59,7 +59,7 @@ def learn_covariance(
     data : LearningData
         From the same call.
     seed : int
-        Seed of the split of the points where some are held out.
+        Seed of the split of the points for held-out scores.
     should_stop : callable, optional
         Called between rounds of EM; once it returns True, the best covariance so far is returned.
     """

@@ -1,8 +1,8 @@
-"""Alternation under perspective: depths, covariance, cameras and κ by turns, and new cameras from the corrected tracks.
+"""Alternation under perspective between depths, covariance, cameras and κ, and new cameras from the corrected tracks.
 
-Cameras that were found under orthography are off by degrees where perspective is strong, and with little noise the likelihood cannot move
-them back, since every mode would have to move along. A factorization of the corrected tracks has no such memory: it gives cameras from
-nothing, with most of the perspective gone. The alternation goes on from the most probable of them for as long as the evidence rises.
+Cameras estimated under orthography are off by degrees where perspective is strong, and with little noise the likelihood cannot turn them
+back, since every mode would have to change as well. A factorization of the corrected tracks is independent of these cameras, and most of
+the perspective is gone. The alternation continues from the most probable factorization while the evidence rises.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from pliant.solver.refinement.learned import Learned
 from pliant.solver.tracks.frame_selection import evenly_spread
 
 ALTERNATION_ROUNDS = 3
-"""Updates of depths, covariance, cameras and κ every time that cameras were found or refined."""
+"""Updates of depths, covariance, cameras and κ each time that cameras were found or refined."""
 
 ALTERNATION_EM_ROUNDS = 60
-"""Rounds of expectation maximisation of an update."""
+"""EM rounds per update."""
 
 COMPARED_FRAMES = 40
 """Frames on which the cameras of factorizations are compared, as in `starts.START_FRAMES`."""
@@ -43,18 +43,18 @@ def alternated(
     rounds: int = ALTERNATION_ROUNDS,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[Learned, Perspective]:
-    """Return cameras, covariance and κ after rounds of alternation, those before a round that leads to depths beyond any measure.
+    """Return cameras, covariance and κ after rounds of alternation, which end before a round whose depths diverge.
 
     Parameters
     ----------
     view : Perspective
-        With κ to start from and the sample of all frames.
+        Starting κ, and the sample at all frames.
     found : Learned
-        Cameras and covariance of the frames used to start from.
+        Starting cameras and covariance, at the frames used.
     used : array of int, shape (F',)
-        Frames.
+        Indices of the frames used.
     model_order : ModelOrder
-        Modes at most, and the noise to begin with.
+        Maximum number of modes, and the starting noise.
     turning : bool
         False keeps the rotations.
     rounds : int
@@ -87,9 +87,9 @@ def factorized_again(
     Parameters
     ----------
     gram : array, shape (2F, 2F)
-        Of the corrected tracks, divided by the scales.
+        W Wᵀ / P of the corrected tracks, divided by the scales.
     view, found, used, model_order, should_stop
-        As for `alternated`. The factorizations get the world axes and the sign of depth of `found`.
+        As for `alternated`. The factorizations are aligned to the world axes and the sign of depth of `found`.
     """
     places = evenly_spread(len(used), COMPARED_FRAMES)
     some = used[places]
@@ -115,7 +115,7 @@ def factorized_again(
 
 
 def aligned(rotations: Floats, like: Floats, used: NDArray[np.intp]) -> Floats:
-    """Return rotations `(F, 3, 3)` in the world axes and with the sign of depth in which those of the frames used are nearest to `like`."""
+    """Return rotations `(F, 3, 3)` in the world axes and with the sign of depth that bring the frames used closest to `like`."""
     choices = []
     for each in (rotations, MIRROR @ rotations @ MIRROR):
         moved = each @ nearest((each[used].transpose(0, 2, 1) @ like).sum(axis=0)[None])[0]

@@ -1,4 +1,4 @@
-"""Camera estimates under perspective: tracks → cameras and covariance → depths → corrected tracks → again."""
+"""Camera estimation under perspective: the cycle tracks → cameras and covariance → depths → corrected tracks."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from pliant.solver.tracks.frame_selection import between
 from pliant.solver.tracks.normalization import Normalized
 
 RESTARTS = 3
-"""Maximum number of times that the alternation starts again from cameras of the corrected tracks; the evidence settles after one or two."""
+"""Maximum number of restarts of the alternation from cameras of the corrected tracks; the evidence converges after one or two."""
 
 MIN_GAIN = 0.01
-"""Decrease of the energy, per point and frame, below which another restart is not tried: equal solutions from different starts differ by
+"""Decrease of the energy, per point and frame, below which no further restart is tried: equal solutions from different starts differ by
 as much (`focal_length.MIN_PERSPECTIVE_GAIN`)."""
 
 
@@ -37,20 +37,20 @@ def settled(
     turning: bool,
     should_stop: Callable[[], bool] | None = None,
 ) -> CameraEstimate:
-    """Return the estimate with κ found and the tracks corrected, or unchanged but for the trace where κ is 0.
+    """Return the estimate with κ determined and the tracks corrected; if κ is 0, only `perspective` is updated.
 
     Parameters
     ----------
     estimate : CameraEstimate
-        Of the tracks as they are, with `perspective` as far as it is given.
+        Estimate from the uncorrected tracks; `perspective` has the given parameters.
     normalized : Normalized
-        The tracks as they are.
+        The uncorrected tracks.
     used : array of int, shape (F',)
         Frames to learn from.
     model_order : ModelOrder
-        Modes at most, and the noise to begin with.
+        Maximum number of modes, and the starting noise.
     turning : bool
-        False leaves the rotations, but for the sign of depth.
+        False keeps the rotations, except for the sign of depth.
     should_stop : callable, optional
         Called between fits; once it returns True, the best so far is returned.
     """
@@ -89,9 +89,9 @@ def _restarted(
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None = None,
 ) -> CameraEstimate:
-    """Return the estimate after alternations from cameras of the corrected tracks, for as long as the evidence rises.
+    """Return the estimate after alternations from cameras of the corrected tracks, repeated while the evidence rises.
 
-    `found` holds cameras and covariance of the frames used that belong to the estimate.
+    `found` holds the estimate's cameras and covariance at the frames used.
     """
     wide = np.repeat(np.asarray(estimate.scales), 2)
     for _ in range(RESTARTS):
@@ -123,7 +123,7 @@ def settled_again(
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[CameraEstimate, Learned]:
-    """Return the estimate with tracks corrected anew, now that cameras and covariance are refined, and both refined once more.
+    """Return the estimate with tracks corrected for the refined cameras and covariance, and these refined once more.
 
     `found` belongs to tracks divided by `scales`, shape `(F',)`.
     """
@@ -137,7 +137,7 @@ def settled_again(
 def with_depth_map(
     estimate: CameraEstimate, covariance: ShapeCovariance, rotations: Floats, scales: Floats
 ) -> CameraEstimate:
-    """Return the estimate with the depths of this covariance and these cameras, in the same axes, where tracks are corrected."""
+    """Return the estimate with D of this covariance and these cameras, in the same axes, if tracks are corrected."""
     view = estimate.perspective
     if view is None or not view.bends:
         return estimate
@@ -148,7 +148,7 @@ def with_depth_map(
 def _applied(
     estimate: CameraEstimate, normalized: Normalized, used: NDArray[np.intp], found: Learned, view: Perspective
 ) -> CameraEstimate:
-    """Return the estimate with the cameras found, and with Gram matrix, sample and translations of the corrected tracks."""
+    """Return the estimate with the rotations found, and with Gram matrix, sample and translations of the corrected tracks."""
     frames = len(normalized.points)
     before = np.asarray(estimate.rotations)
     turns = logarithm(found.rotations @ before[used].transpose(0, 2, 1))

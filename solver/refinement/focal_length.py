@@ -1,13 +1,13 @@
 """Focal length and sign of depth by the marginal likelihood of tracks corrected for perspective.
 
-For every κ = 1/φ that is compared the tracks are corrected with posterior depths, and a covariance of the shapes is learned anew from them
-with the cameras as they are (`cameras.perspective`, `model.shape_covariance`). Perspective that is not corrected passes for deformation
-and needs modes; corrected with the wrong κ or the wrong sign of depth it needs more. The likelihood of the corrected tracks, with the
-density of the correction, therefore has its maximum near the true κ; κ < 0 stands for mirrored depths, and κ = 0 is orthography.
+For each κ = 1/φ compared, the tracks are corrected with posterior depths, and a covariance of the shapes is learned from them with the
+cameras fixed (`cameras.perspective`, `model.shape_covariance`). Uncorrected perspective looks like deformation and needs modes; a
+correction with the wrong κ or the wrong sign of depth needs more of them. The likelihood of the corrected tracks, including the density
+of the correction, therefore has its maximum near the true κ; κ < 0 stands for mirrored depths, and κ = 0 is orthography.
 
-The comparison needs few frames. What it finds is then refined on all of them together with cameras and modes: between two updates of the
-depths z the corrected tracks v + κ v z are linear in κ, so that their Gram matrix is G₀ + κ G₁ + κ² G₂, and κ is one more parameter of
-L-BFGS with the gradient
+The comparison needs few frames. Its κ is then refined on all frames, jointly with cameras and modes: between two updates of the depths z,
+the corrected tracks v + κ v z are linear in κ, so their Gram matrix is G₀ + κ G₁ + κ² G₂, and L-BFGS treats κ as one more parameter with
+the gradient
 
     ∂E/∂κ = tr M⁻¹(G₁ + 2κ G₂) / 2F − 2 mean z/(1 + κz).
 """
@@ -40,31 +40,31 @@ from pliant.solver.tracks.frame_selection import evenly_spread
 from scipy.optimize import minimize
 
 CURVATURES = (0.02, 0.035, 0.06, 0.1, 0.16, 0.25, 0.38)
-"""κ compared, in inverse RMS radii of the tracks, each with both signs. At .02 the correction is 1 % to 2 % of a position; at .38 an object
-fills 80° of the view."""
+"""Values of κ compared, in inverse RMS radii of the tracks, each with both signs. At .02 the correction is 1 % to 2 % of a position; at
+.38 an object fills 80° of the view."""
 
 SEARCH_FRAMES = 32
-"""Frames on which values of κ are compared, evenly spread; fewer where there are fewer than two points for each."""
+"""Frames on which values of κ are compared, evenly spread; fewer if there are fewer than two points per frame."""
 
 UPDATES = 2
 """Updates of depths and covariance for every κ."""
 
 SEARCH_EM_ROUNDS = 40
-"""Rounds of expectation maximisation of an update, from scratch, so that all values of κ are judged alike."""
+"""EM rounds of an update, from scratch, so that the comparison of κ is fair."""
 
 MAX_POLISHES = 3
-"""Values of κ that are compared between the best of the grid and its neighbours."""
+"""Maximum number of further values of κ, between the best of the grid and its neighbours."""
 
 MIN_PERSPECTIVE_GAIN = 0.02
-"""Likelihood per point and frame, as a logarithm, by which perspective must be more probable than orthography, and one sign of depth than
-the other. Equal κ from different starts differ by up to .01."""
+"""Gain in log likelihood, per point and frame, required of perspective over orthography and of one sign of depth over the other.
+Equal κ from different starts differ by up to .01."""
 
 MIN_TOTAL_GAIN = 10.0
-"""Likelihood of all observations together, as a logarithm, by which perspective must be more probable: few observations are no evidence.
-Kass and Raftery (1995), Bayes factors, call 5 very strong."""
+"""Gain in log likelihood of all observations together required of perspective: few observations are weak evidence. Kass and Raftery
+(1995), Bayes factors, call 5 very strong."""
 
 COMPARED_RATIO = 1.6
-"""A given focal length is compared with ones that are longer and shorter by this factor."""
+"""Factor between a given focal length and the longer and shorter ones that it is compared with."""
 
 UPDATE_ITERATIONS = 60
 """L-BFGS iterations of κ, cameras and modes between two updates of the depths."""
@@ -72,7 +72,7 @@ UPDATE_ITERATIONS = 60
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Trial:
-    """What one κ led to."""
+    """A value of κ with the depths and covariance learned for it."""
 
     curvature: float
     nll: float
@@ -89,20 +89,20 @@ def search(
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[Perspective, ShapeCovariance]:
-    """Return what comparing values of κ shows, κ = 0 unless the tracks need perspective, and the covariance learned with it.
+    """Return the perspective with the best κ, 0 unless the tracks need perspective, and the covariance learned with it.
 
     Parameters
     ----------
     views : array, shape (F, S, 2)
-        Complete tracks of some points relative to the principal point, normalized units.
+        Complete tracks of sampled points, relative to the principal point, normalized units.
     rotations, scales : arrays, shapes (F, 3, 3) and (F,)
         Cameras found under orthography.
     view : Perspective
-        What is given; `curvature` of the result is negative if the depths of these cameras have to be mirrored.
+        Given parameters. The `curvature` returned has the sign opposite to `signs[0]` if depths must be mirrored.
     model_order : ModelOrder
-        Modes at most, and the noise to begin with.
+        Maximum number of modes, and the starting noise.
     should_stop : callable, optional
-        Called between values of κ; once it returns True, the best so far counts.
+        Called between values of κ; once it returns True, the best so far is used.
     """
     count = max(min(SEARCH_FRAMES, len(views), views.shape[1] // 2), 3)
     used = evenly_spread(len(views), count)
@@ -133,24 +133,24 @@ def search(
 def _judged(
     curvature: float, trial: _Trial, views: Floats, rotations: Floats, scales: Floats, model_order: ModelOrder
 ) -> _Trial:
-    """Return what κ leads to after `UPDATES` of depths and covariance that begin with those of a trial."""
+    """Return the trial of κ after `UPDATES` updates of depths and covariance, starting from those of `trial`."""
     projections = rotations[:, :2] * scales[:, None, None]
     for _ in range(UPDATES):
         try:
             depth = depth_map(rotations, scales, trial.covariance)
             depths = depths_of(depth, views, curvature, start=trial.depths)
             covariance = _learn(views, depths, curvature, projections, model_order)
-        except np.linalg.LinAlgError:  # depths beyond any measure
+        except np.linalg.LinAlgError:  # the depths diverge
             return replace(trial, curvature=curvature, nll=UNLIKELY)
         trial = _Trial(curvature, covariance.nll + density(depths, curvature), depths, covariance)
     return trial
 
 
 def _walk(view: Perspective, trials: dict[float, _Trial]) -> Iterator[tuple[float, int]]:
-    """Yield sizes and signs of κ to compare, given what was found so far.
+    """Yield sizes and signs of κ to compare, given the trials so far.
 
-    A given focal length is compared with two others. Otherwise sizes rise; where the smallest two gain nothing the rest is not looked
-    at, a sign is given up when the other is clearly better, and the way ends beyond its minimum.
+    A given focal length is compared with two others. Otherwise sizes increase; a sign is dropped once the other is clearly
+    better. The search ends if the two smallest sizes gain nothing, or once it has passed the minimum.
     """
     if view.given is not None:
         yield from (
@@ -186,12 +186,12 @@ def _learn(
 
 
 def _best(trials: dict[float, _Trial]) -> float:
-    """Return the most probable κ that is not 0."""
+    """Return the most probable κ ≠ 0; 0 if there is none."""
     return min((each for each in trials if each != 0), key=lambda each: trials[each].nll, default=0.0)
 
 
 def _around(trials: dict[float, _Trial]) -> tuple[Floats, Floats] | None:
-    """Return the best κ ≠ 0 and its neighbours, and how improbable they are; None where it lies at the end of what was compared."""
+    """Return the best κ ≠ 0 with its neighbours, and their negative log likelihoods; None if it is the first or last compared."""
     values = np.array(sorted(trials))
     place = int(np.searchsorted(values, _best(trials)))
     if not 0 < place < len(values) - 1:
@@ -201,13 +201,13 @@ def _around(trials: dict[float, _Trial]) -> tuple[Floats, Floats] | None:
 
 
 def _parabola(three: Floats, nll: Floats) -> tuple[float, float]:
-    """Return the place of the minimum of the parabola through three points, and its second derivative."""
+    """Return the minimiser of the parabola through three points (the middle one if concave), and its second derivative."""
     curve, slope, _ = np.polyfit(three - three[1], nll, 2)
     return float(three[1] - slope / (2 * curve)) if curve > 0 else float(three[1]), 2 * float(curve)
 
 
 def _between(trials: dict[float, _Trial]) -> float | None:
-    """Return the κ to compare next: the parabola's minimum, or the middle of the wider side where that is known already."""
+    """Return the κ to compare next: the parabola's minimiser or, near the best κ, a point a third into the wider side."""
     found = _around(trials)
     if found is None:
         return None
@@ -222,9 +222,9 @@ def _between(trials: dict[float, _Trial]) -> float | None:
 
 
 def _decided(view: Perspective, trials: dict[float, _Trial], frames: int, points: int) -> Perspective:
-    """Return κ by evidence, its standard deviation, and whether the sign of depth is settled.
+    """Return the perspective with the most probable κ, its standard deviation, and whether the sign of depth is known.
 
-    The points of a surface move together; they count as 1/`CAMERA_PRIOR_WEIGHT` independent ones at most.
+    The points of a surface move together, so they count as at most 1/`CAMERA_PRIOR_WEIGHT` independent ones.
     """
     candidates = tuple(Candidate(each, trials[each].nll) for each in sorted(trials))
     if view.given is not None:
@@ -293,7 +293,7 @@ def refined_with_focal(
 
 
 class corrected_energy:  # noqa: N801
-    """E of tracks corrected with fixed depths, as a function of all parameters of the likelihood and, last, κ."""
+    """E of tracks corrected with fixed depths, as a function of the likelihood's parameters, followed by κ."""
 
     def __init__(self, views: Floats, depths: Floats, found: Learned, *, with_scales: bool) -> None:
         count = views.shape[1]

@@ -1,4 +1,4 @@
-"""Scales of the frames, adopted where the likelihood of the tracks is clearly higher with them.
+"""Per-frame scales, adopted if they clearly raise the likelihood of the tracks.
 
 The likelihood penalises each mode of deformation, so it distinguishes a camera that zooms from a shape that grows
 (`cameras.scale`).
@@ -18,21 +18,21 @@ from pliant.solver.refinement.learned import Learned, learned_at, turned
 from pliant.solver.tracks.frame_selection import between, evenly_spread, of_frames
 
 SCALE_FRAMES = 120
-"""Frames used to decide whether scales are free; with 60 instead of 120 chance gains of fixed scales reach .054."""
+"""Frames used to decide whether scales are free; with 60, chance gains on sequences of constant scale reach .054."""
 
 SMOOTH_ITERATIONS = 120
-"""L-BFGS iterations for the scales of smooth modes, as many as those of `SCALE_ROUNDS`."""
+"""L-BFGS iterations for scales with smooth modes, as many as in `SCALE_ROUNDS` refinements."""
 
 SCALE_ROUNDS = 2
 """Refinements used to decide whether scales are free."""
 
 MIN_SCALE_GAIN = 0.12
 """Decrease of the energy, per point and frame, required to free scales that vary from frame to frame. BIC for one
-parameter per frame gives .075; fixed scales gain up to .08 by chance, real scale changes .23 and more."""
+parameter per frame gives .075; constant scales gain up to .08 by chance, real scale changes .23 and more."""
 
 SMOOTH_SCALE_SHARE = 0.4
 """Share of `MIN_SCALE_GAIN` required of slowly varying scales, which need fewer parameters: a swing of .05 over 60
-frames gains .058, none up to .04."""
+frames gains .058, constant scales up to .04."""
 
 MIN_SCALE_STD = 0.01
 """Standard deviation of log s below which scales stay 1."""
@@ -40,13 +40,13 @@ MIN_SCALE_STD = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleTrial:
-    """What freeing the scales of some frames gained."""
+    """Result of freeing the scales of some frames."""
 
     start: Floats | None
-    """Scales of all frames to start from, mean logarithm 0; None where free scales gain no more than chance."""
+    """Scales of all frames to start from, mean logarithm 0; None if free scales gain no more than chance or are implausible."""
 
     reason: str
-    """A sentence."""
+    """A sentence for the report."""
 
     fixed: Learned
     """Cameras and covariance of the frames compared, with scales of 1."""
@@ -62,10 +62,9 @@ def try_free_scales(
 ) -> ScaleTrial:
     """Compare free scales with scales of 1 on a subset of the frames.
 
-    Scales are free from two starts, 1 and those of a rigid shape. Deformation that is mistaken for scale ends in a worse
-    minimum than fixed scales, or in one with nearly constant scales. With `turning` False the rotations are kept. The scales of
-    a rigid shape are then a poor start, because nothing but the scales can absorb the deformation; those found with smooth
-    modes are a third one.
+    Free scales start from 1 and from the scales of a rigid shape. Where they mistake deformation for scale, the result is a worse
+    minimum than with fixed scales, or nearly constant scales. With `turning` False, rotations are kept. The scales of a rigid shape
+    are then a poor start, because only they can absorb the deformation; scales fitted with smooth modes are a third start.
     """
     used = evenly_spread(len(rotations), SCALE_FRAMES)
     part, given, none = of_frames(gram, used), rotations[used], np.ones(len(used))
@@ -87,7 +86,7 @@ def try_free_scales(
     gain, logs = fixed.energy - best.energy, np.log(best.scales)
     extent = f"from {best.scales.min():.3f} to {best.scales.max():.3f}"
     if logs.std() > WIDEST:
-        return ScaleTrial(None, f"Every scale is 1: those found, {extent}, are wider apart than any camera's.", fixed)
+        return ScaleTrial(None, f"Every scale is 1: those found, {extent}, vary more than those of any camera.", fixed)
     share = _scale_gain_share(logs) if model_order.ordered else 1.0
     if not (gain > MIN_SCALE_GAIN * share and logs.std() > MIN_SCALE_STD):
         reason = (
@@ -101,7 +100,7 @@ def try_free_scales(
 
 
 def _smooth_scales(gram: Floats, rotations: Floats, *, ordered: bool, should_stop: Callable[[], bool] | None) -> Floats:
-    """Return the most probable scales of given rotations where the modes are smooth and the noise is large, shape `(F,)`."""
+    """Return the most probable scales for given rotations under smooth modes and large noise, shape `(F,)`."""
     scene = Scene.of(gram, rotations, with_scales=True, ordered=ordered)
     begun = start(scene, np.ones(len(rotations)))
     moved, _ = fit(scene, begun, iterations=SMOOTH_ITERATIONS, turning=False, should_stop=should_stop)

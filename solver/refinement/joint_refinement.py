@@ -2,7 +2,7 @@
 
 Rotations estimated without a model of the deformation absorb part of it as camera motion. With a learned covariance
 (`model.shape_covariance`) the likelihood determines both (`model.marginal_likelihood`, without its penalty on rough
-modes, which the random walk replaces); they are improved alternately.
+modes, which the random walk replaces); they are refined alternately.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ REFINEMENT_ROUNDS = 5
 since it keeps modes and random walk apart."""
 
 COUPLED_ROUNDS = 2
-"""Refinements after that of the coupled modes."""
+"""Refinements after the fit of the coupled modes."""
 
 
 def refine_cameras(
@@ -51,22 +51,22 @@ def refine_cameras(
     y_up: bool = False,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[CameraEstimate, LearningData]:
-    """Return the cameras, refined if `turning`, and what the shape covariance of all frames is learned from.
+    """Return the cameras, refined if `turning`, and the data from which the shape covariance of all frames is learned.
 
     Parameters
     ----------
     estimate : CameraEstimate
-        Where to start, with the Gram matrix and the sample of the completed tracks; its translations are kept.
+        Starting cameras, with the Gram matrix and the sample of the completed tracks.
     shown : array, shape (F,)
         Frames that show enough points to learn from; the others are interpolated.
     turning : bool
-        False keeps the cameras fixed.
+        False keeps the rotations, except for the sign of depth.
     estimates_scales : bool
         True frees scales that are all 1 if that gains more likelihood than chance.
     seed : int
-        Seed of the split of the points where some are held out.
+        Seed of the split of the points for held-out scores.
     normalized : Normalized, optional
-        The tracks themselves, needed where `estimate.perspective` is given.
+        The uncompleted tracks; without them, perspective and hidden entries are ignored.
     y_up : bool
         Whether y points up in the images.
     should_stop : callable, optional
@@ -104,8 +104,8 @@ def refine_cameras(
             evidence, found, normalized, with_scales=trial is not None and trial.start is not None,
             turning=True, should_stop=should_stop,
         )  # fmt: skip
-        # The order suits completed tracks; moments state what hidden entries leave open. Errors without a limit and with the
-        # order kept: shark with all errors .063 and .088, face landmarks .027 and .024.
+        # The order limits the modes of completed tracks; expected moments include the uncertainty of hidden entries. Errors
+        # without and with the limit: shark with all errors .063 and .088, face landmarks .027 and .024.
         model_order = replace(model_order, max_modes=MAX_MODES)
     refined_estimate, rotations = _of_all_frames(start, evidence, found, trial)
     if not evidence.bends and not bulges(found, evidence.sample, y_up=y_up):
@@ -125,7 +125,7 @@ def _started(
     turning: bool,
     should_stop: Callable[[], bool] | None,
 ) -> Evidence:
-    """Return the most probable start, with tracks corrected for perspective where they need it."""
+    """Return the most probable start, with tracks corrected for perspective if needed."""
     if turning and (others := len(start.estimate.hypotheses) + len(start.estimate.candidates)):
         enter(should_stop, "starts", units=UNITS_PER_START * (1 + others))
         best = best_start(start.estimate, start.gram, start.used, model_order, should_stop)
@@ -147,9 +147,9 @@ def _with_free_scales(
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None,
 ) -> Evidence:
-    """Return the evidence with scales of given rotations, where free ones gain more likelihood than chance.
+    """Return the evidence for given rotations, with free scales if they gain more likelihood than chance.
 
-    `unsettled` has the tracks as they are, to be corrected for perspective with these scales.
+    `unsettled` has the uncorrected tracks, which are then corrected for perspective with these scales.
     """
     enter(should_stop, "scales")
     trial = try_free_scales(settled.gram, settled.rotations, model_order, should_stop, turning=False)
@@ -180,7 +180,7 @@ def _refined(
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None,
 ) -> tuple[Evidence, Learned]:
-    """Return the refined cameras and covariance of the frames used, and the tracks as their depths correct them."""
+    """Return the tracks, corrected with the refined depths, and the refined cameras and covariance of the frames used."""
     estimate, with_scales, bends = evidence.estimate, trial is not None and trial.start is not None, evidence.bends
     may_couple = model_order == ModelOrder(ordered=estimate.ordered)
     enter(should_stop, "refinement", units=REFINEMENT_UNITS[may_couple])
@@ -199,7 +199,7 @@ def _refined(
 def _first_rounds(
     evidence: Evidence, trial: ScaleTrial | None, model_order: ModelOrder, should_stop: Callable[[], bool] | None
 ) -> Learned:
-    """Return cameras and covariance after `REFINEMENT_ROUNDS`, of which the trial of scales may have done some."""
+    """Return cameras and covariance after `REFINEMENT_ROUNDS`, including those of the scale trial if it used the same frames."""
     count = len(evidence.used)
     if trial is not None and trial.start is None and len(trial.fixed.rotations) == count:
         rounds = REFINEMENT_ROUNDS - SCALE_ROUNDS
@@ -218,7 +218,7 @@ def _with_settled_depths(
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None,
 ) -> tuple[Evidence, Learned]:
-    """Return the tracks corrected with the depths of the cameras and the covariance found, and both refined once more."""
+    """Return the tracks, corrected with the depths of `found`, and `found` refined once more."""
     assert normalized is not None
     used = evidence.used
     estimate, found = settled_again(
@@ -231,7 +231,7 @@ def _with_settled_depths(
 def _with_probable_depth(
     evidence: Evidence, found: Learned, model_order: ModelOrder, should_stop: Callable[[], bool] | None
 ) -> tuple[Evidence, Learned]:
-    """Return cameras and covariance at the most probable depth; where the tracks hardly determine it, the best of all candidates."""
+    """Return cameras and covariance at the most probable depth; if the tracks hardly determine it, the best of all candidates."""
     found, stretch = settled_depth(evidence.gram, found)
     estimate = _with_depth_choice(evidence.estimate, stretch)
     if estimate.depth_is_typical:
@@ -240,7 +240,7 @@ def _with_probable_depth(
 
 
 def _mirrored(estimate: CameraEstimate, rotations: Floats, found: Learned) -> tuple[CameraEstimate, Floats, Learned]:
-    """Return the mirror images in depth of cameras of all frames, in both axes, and of those that belong to the covariance."""
+    """Return the estimate, its rotations in the axes of `found`, and `found`, all mirrored in depth."""
     ours, other = (MIRROR @ np.asarray(each) @ MIRROR for each in (estimate.rotations, rotations))
     read_only(ours)
     own, covariance = mirrored(found.rotations, found.covariance)
@@ -269,7 +269,7 @@ def _of_observations(
     turning: bool,
     should_stop: Callable[[], bool] | None,
 ) -> tuple[Evidence, Learned]:
-    """Return cameras and covariance of the observations themselves, where entries are hidden or replaced."""
+    """Return cameras and covariance estimated from the observations themselves, without hidden or replaced entries."""
     estimate, used = evidence.estimate, evidence.used
     enter(should_stop, "observations")
     translations = np.array(estimate.translations)
@@ -284,7 +284,7 @@ def _of_observations(
 
 
 def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Callable[[], bool] | None) -> Learned:
-    """Return the cameras refined with modes that have axes of their own (`model.full_mode_covariance`), if they are more probable."""
+    """Return the cameras refined with a covariance between modes (`model.full_mode_covariance`), if they are more probable."""
     scene = scene_at(gram, found.rotations, with_scales=with_scales, ordered=found.covariance.ordered)
     rotations, scales = full_mode_covariance.refined(scene, found.scales, found.covariance, should_stop=should_stop)
     again = refined(
@@ -295,7 +295,7 @@ def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Ca
 
 
 def _with_rotation_reason(estimate: CameraEstimate, rotations: Floats, before: Floats) -> CameraEstimate:
-    """Return the estimate with new rotations, the first of them the identity, and a sentence about it."""
+    """Return the estimate with new rotations, relative to the first frame, and a sentence about the change."""
     rotations = rotations @ rotations[0].T
     turn = float(np.degrees(angles_between(rotations, before).mean()))
     sentence = f"Then refined together with the covariance of the shapes; rotations moved by {turn:.2f}° on average."
@@ -307,11 +307,11 @@ def _with_rotation_reason(estimate: CameraEstimate, rotations: Floats, before: F
 
 
 def _with_depth_choice(estimate: CameraEstimate, stretch: float) -> CameraEstimate:
-    """Return the estimate, with a sentence where the tracks leave the extent of depth to the prior: λ or 1/λ is at least `DECIDED`."""
+    """Return the estimate, with a sentence if the prior determines the extent of depth: λ or 1/λ is at least `DECIDED`."""
     if abs(np.log(stretch)) < np.log(DECIDED):
         return estimate
     sentence = (
         f"The tracks hardly distinguish depth from rotation: {1 / stretch:.2g} times the depth with {stretch:.2g} times the rotation "
-        "explains them about as well. The depth is one that is usual for the width, as of half a sphere."
+        "explains them about as well. The depth is typical for the width, like that of half a sphere."
     )
     return replace(estimate, depth_is_typical=True, reasons={**estimate.reasons, "depth_extent": sentence})

@@ -1,4 +1,4 @@
-"""Cameras and shape covariance that belong together, and their refinement by the marginal likelihood."""
+"""Cameras with the shape covariance learned for them, and their refinement by the marginal likelihood."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ REFINEMENT_PRIOR_WEIGHT = 0.01
 """Weight of the camera-motion prior: less is needed once the covariance is known."""
 
 LEAST_NOISE = 1e-12
-"""What is left of σ² where it lies at its floor, which the likelihood adds again."""
+"""Minimum of σ² after subtraction of its floor, which the likelihood adds back; normalized units squared."""
 
 START_EM_ROUNDS = 90
-"""Maximum number of EM rounds of a run before a refinement; L-BFGS, which follows, gains more in the same time. Error of faces
-of 99 frames with 60, 90 and 150: .0146, .0132, .0138, differences that may be chance."""
+"""Maximum number of EM rounds before a refinement; the L-BFGS that follows gains more in the same time. Errors of faces of 99
+frames with 60, 90 and 150 rounds: .0146, .0132, .0138, differences that may be chance."""
 
 ROTATION_ITERATIONS = 60
 """L-BFGS iterations per refinement of the rotations."""
@@ -28,7 +28,7 @@ ROTATION_ITERATIONS = 60
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Learned:
-    """Cameras and covariance that belong together."""
+    """Cameras and the covariance learned for them."""
 
     rotations: Floats
     """Shape `(F, 3, 3)`."""
@@ -39,15 +39,15 @@ class Learned:
     covariance: ShapeCovariance
 
     energy: float
-    """Of `model.marginal_likelihood`, without a penalty on modes; infinite before the first refinement."""
+    """Energy of `model.marginal_likelihood`, without a penalty on modes; infinite before the first refinement."""
 
 
 def scene_at(
     gram: Floats, rotations: Floats, *, with_scales: bool, ordered: bool, factor: Floats | None = None
 ) -> Scene:
-    """Return the scene whose cameras at zero turn are these; if unordered, without the camera-motion prior.
+    """Return the scene whose cameras at zero turn are `rotations`; without the camera-motion prior if unordered.
 
-    `factor`, shape `(2F, r)`, stands for a Gram matrix that is not formed; `gram` is then empty.
+    `factor`, shape `(2F, r)`, replaces a Gram matrix that would be too large; `gram` is then empty.
     """
     return Scene(
         gram, rotations, with_scales=with_scales, prior_weight=REFINEMENT_PRIOR_WEIGHT if ordered else 0.0,
@@ -67,7 +67,7 @@ def motion_of(scene: Scene, found: Learned) -> Motion:
 
 
 def moved_to(scene: Scene, found: Learned, moved: Motion, energy: float) -> Learned:
-    """Return what the parameters of the likelihood describe."""
+    """Return the cameras and covariance that the parameters of the likelihood describe."""
     mean_covariance, axis_covariance, noise, walk_variance = covariances_of(scene, moved)
     axis_covariance = axis_covariance + AXIS_VARIANCE_FLOOR * np.trace(axis_covariance) / 3 * np.eye(3)
     size = np.trace(axis_covariance) / 3
@@ -106,7 +106,7 @@ def learned_at(
     *,
     iterations: int = START_EM_ROUNDS,
 ) -> Learned:
-    """Return given cameras and the covariance learned with them from scratch, in `iterations` rounds of EM at most."""
+    """Return given cameras and a covariance learned for them from scratch, in at most `iterations` EM rounds."""
     covariance = learned(
         gram,
         rotations[:, :2] * scales[:, None, None],

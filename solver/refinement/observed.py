@@ -1,9 +1,9 @@
 """Cameras and shape covariance from the observations themselves: hidden entries and outliers by expectation.
 
-The completion of `tracks.completion` knows nothing of cameras and shapes, takes its predictions for observations, and follows some
-outliers. `cross_fitted` finds these outliers with a covariance that was learned from other points, and `on_observations` ends the estimate
-of the cameras: expected moments of the complete tracks (`model.observation_model`) and cameras by turns, which is expectation maximisation
-with L-BFGS on the marginal likelihood as its second step.
+The completion of `tracks.completion` ignores cameras and shapes, treats its predictions as observations, and follows some outliers.
+`cross_fitted` finds these outliers with a covariance learned from other points. `on_observations` completes the camera estimation: it
+alternates between expected moments of the complete tracks (`model.observation_model`) and cameras, which is expectation maximisation with
+L-BFGS on the marginal likelihood as its M-step.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ ROUNDS = 3
 """Updates of expected moments and cameras; other numbers were not tried."""
 
 FOLDS = 2
-"""Parts of the points, each judged by a covariance that was learned from the others; other numbers were not tried."""
+"""Folds of the points, each scored by a covariance learned from the others; other numbers were not tried."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """What was observed of the sampled points, in the frames used."""
+    """Observations of the sampled points in the frames used."""
 
     points: Floats
     """Shape `(F', S, 2)`, normalized units, about the centroids of the visible points."""
@@ -39,7 +39,7 @@ class Observed:
     """v, shape `(F', S)`, at most 1; 0 where hidden."""
 
     weight: Floats
-    """v without what completion replaced as outliers, shape `(F', S)`."""
+    """v, but 0 for entries that completion replaced as outliers, shape `(F', S)`."""
 
     chosen: NDArray[np.intp]
     """Indices of the sampled points, shape `(S,)`."""
@@ -61,7 +61,7 @@ class Observed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moments:
-    """Expected complete tracks of the sampled points, divided by the scales of the start."""
+    """Expected complete tracks of the sampled points, divided by the starting scales."""
 
     gram: Floats
     """Expectation of W Wᵀ / S about the centroids, shape `(2F', 2F')`."""
@@ -84,20 +84,20 @@ def cross_fitted(
     seed: int,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[Floats, float]:
-    """Return the probability that an observation is an inlier, shape `(F', S)`, and the share of outliers.
+    """Return the probability that each observation is an inlier, shape `(F', S)`, and the share of outliers.
 
-    Points are judged by a covariance of the others: one that was learned from a point with outliers has modes that follow them.
+    Each point is scored by a covariance learned from others: modes learned from a point with outliers follow these.
 
     Parameters
     ----------
     observed : Observed
-        Of the same frames.
+        Observations in the same frames.
     estimate : CameraEstimate
-        First cameras, and the completed tracks; no perspective is corrected yet.
+        First cameras, and completed tracks that are not yet corrected for perspective.
     used : array of int, shape (F',)
-        Frames.
+        Indices of the frames used.
     seed : int
-        Of the parts.
+        Seed of the folds.
     should_stop : callable, optional
         Called between rounds of EM.
     """
@@ -114,7 +114,7 @@ def cross_fitted(
             rows @ rows.T / rows.shape[1], projections, iterations=START_EM_ROUNDS, ordered=estimate.ordered, should_stop=should_stop
         )  # fmt: skip
         image, weight, share = covariance.of_image(projections), observed.weight[:, own], estimate.outliers
-        for _ in range(2):  # the second time without what the first one found
+        for _ in range(2):  # the second pass rejects the outliers of the first
             found[:, own], share = inlier_probabilities(
                 image, covariance.noise_variance, points[:, own], observed.confidence[:, own], weight, share=share
             )
@@ -133,18 +133,18 @@ def on_observations(
     turning: bool,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[Learned, Moments]:
-    """Return cameras and covariance of the observations, and the moments that they belong to.
+    """Return cameras and covariance estimated from the observations, and the expected moments.
 
     Parameters
     ----------
     observed : Observed
-        Of the frames used.
+        Observations in the frames used.
     found : Learned
-        Cameras and covariance to start from.
+        Starting cameras and covariance.
     completed : Moments
-        Of the completed tracks.
+        Moments of the completed tracks.
     start_scales : array, shape (F',)
-        Scales that the cameras are relative to.
+        Starting scales, to which the cameras are relative.
     with_scales : bool
         Whether scales are refined.
     turning : bool
@@ -164,7 +164,7 @@ def on_observations(
 
 
 def _expected(observed: Observed, found: Learned, before: Moments, start_scales: Floats) -> Moments:
-    """Return the moments under these cameras and this covariance; `before` has the depths by which tracks are corrected."""
+    """Return the moments under these cameras and this covariance; the tracks are corrected with the depths of `before`."""
     points = _corrected(observed, found, before, start_scales) - before.translations[:, None]
     points = np.where(observed.confidence[..., None] > 0, points / start_scales[:, None, None], 0.0)
     projections = found.rotations[:, :2] * found.scales[:, None, None]

@@ -1,6 +1,6 @@
-"""The most probable of several cameras to start from.
+"""Selection of the most probable starting cameras.
 
-Every start is refined a little with the shape covariance that belongs to it; the likelihoods of the tracks are then compared.
+Each start is refined briefly with a shape covariance learned for it; then the likelihoods of the tracks are compared.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from pliant.solver.refinement.learned import Learned, learned_at, refined, turne
 from pliant.solver.tracks.frame_selection import evenly_spread, of_frames
 
 START_FRAMES, COMPARED_EM_ROUNDS, FINALISTS = 40, 45, 3
-"""Frames and rounds of EM with which starting cameras are compared, and how many of the others get a second refinement. On eleven
-sequences the most probable after two refinements is the estimate itself or among the first two after one; with 90 rounds of EM
-it is the same, or as probable to .03; with 30, the cameras of a small face are worse."""
+"""Frames and EM rounds with which starting cameras are compared, and number of alternatives that get a second refinement. On
+eleven sequences the most probable start after two refinements is the estimate itself or among the first two after one. With 90
+EM rounds it is the same, or as probable to .03; with 30, the cameras of a small face are worse."""
 
 CANDIDATE_ROUNDS = 3
-"""Refinements of every candidate where they are compared at settled depths."""
+"""Refinements of every candidate before candidates are compared at their most probable depths."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Trial:
-    """Cameras to start from, and what a short refinement makes of them."""
+    """Starting cameras and the result of their short refinement."""
 
     estimate: CameraEstimate
 
     margin: float
-    """By how much it must be better than another start."""
+    """Energy by which this start must be better than the others."""
 
     found: Learned
 
     @property
     def energy(self) -> float:
-        """Of the refined cameras, with the margin."""
+        """Energy of the refined cameras plus the margin."""
         return self.found.energy + self.margin
 
     def refined(self, gram: Floats, should_stop: Callable[[], bool] | None) -> _Trial:
@@ -54,12 +54,12 @@ def best_start(
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None,
 ) -> CameraEstimate:
-    """Return the estimate with the rotations, its own or those of another start, that give the lowest energy after a short refinement.
+    """Return the estimate with its own rotations or another start's, whichever have the lowest energy after a short refinement.
 
-    The multistart models deformation by smooth modes and moves cameras by degrees to fit it; joint refinement hardly
-    moves them back, because every mode would have to move along. The unrefined cameras of a factorization, those with
-    other pose signs of a sheet, or a candidate that the multistart ranks lower, can therefore be the better start. A
-    candidate must be better by `MAX_HYPOTHESIS_GAP`: smaller differences do not tell true cameras from false ones.
+    The multistart models deformation by smooth modes and turns cameras by degrees to fit it. Joint refinement hardly
+    turns them back, because every mode would have to change as well. The better start can therefore be the unrefined
+    cameras of a factorization, a planar object with other pose signs, or a candidate that the multistart ranks lower. A
+    candidate must be better by `MAX_HYPOTHESIS_GAP`: smaller differences do not separate true cameras from false ones.
     """
     some = evenly_spread(len(used), START_FRAMES)
     part, ones = of_frames(gram, some), np.ones(len(some))
@@ -88,10 +88,10 @@ def best_candidate(
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None,
 ) -> Learned:
-    """Return the most probable cameras among `found` and those from every candidate of the multistart, each at its settled depth.
+    """Return the most probable of `found` and all candidates of the multistart, each at its most probable depth.
 
-    The prior on camera motion prefers rotations that are too small, whatever their direction. Only at comparable depths does it distinguish
-    a turn of the object from its deformation.
+    The camera-motion prior prefers rotations that are too small, whatever their direction. Only at comparable depths can it
+    distinguish rotation of the object from deformation.
     """
     for candidate in estimate.candidates:
         if should_stop is not None and should_stop():

@@ -1,4 +1,4 @@
-"""Attach to a solution the standard deviations of its positions and a verdict on how far to trust it."""
+"""Standard deviations of the positions of a solution, and a verdict on how far to trust it."""
 
 from __future__ import annotations
 
@@ -18,9 +18,8 @@ from pliant.solver.shapes.uncertainty import Pinhole, bounded_by_neighbours, pos
 from pliant.solver.solution import Solution
 
 INFLATION = 1.4
-"""Factor from the standard deviation that posterior and jackknife give to that of the errors, for what both leave out: wrong models, and
-other optima of the cameras. With it the median coverage of the 90 % intervals is .89 on the sequences for calibration of
-`benchmarks.trust`."""
+"""Factor applied to the standard deviation from posterior and jackknife, for errors that both omit: model errors and other optima of the
+cameras. With it, the median coverage of the 90 % intervals is .89 on the calibration sequences of `benchmarks.trust`."""
 
 
 def assessed(
@@ -37,30 +36,30 @@ def assessed(
     centred: bool = True,
     should_stop: Callable[[], bool] | None = None,
 ) -> Solution:
-    """Return the solution with the standard deviation of its positions and how far to trust it.
+    """Return the solution with the standard deviations of its positions and the verdict on it.
 
     Parameters
     ----------
     solution : Solution
-        The tracks' unit.
+        In the tracks' unit.
     tracks : Tracks
-        What it was solved from.
+        The tracks that were solved.
     confidence : ndarray, shape (F, P)
-        Of the observations that were used; 0 where hidden or rejected.
+        Confidence of the observations used; 0 where hidden or rejected.
     estimate, covariance
-        What the shapes were solved with; without a covariance there are no standard deviations.
+        Cameras and prior of the solve. Without a covariance no standard deviations are computed.
     unit : float
         The tracks' unit per normalized unit.
     turning : bool
         Whether the cameras were estimated.
     seed : int
-        Of the sample of patterns of visibility.
+        Seed of the random sample of visibility patterns.
     changes : Changes, optional
-        Of these cameras and this covariance; None computes them.
+        Jackknife result for these cameras and this covariance; None computes it.
     centred : bool
-        Whether the shapes are all points of the object, so that their mean is its centre; otherwise that is the origin.
+        Whether the shapes contain all points of the object, so that their mean is its centre. Otherwise the centre is the origin.
     should_stop : callable, optional
-        Called between units of work; once it returns True, what is left is not computed.
+        Called between units of work; once it returns True, the jackknife is skipped.
     """
     std, held_out = None, None
     tick = should_stop if should_stop is not None else bool
@@ -97,7 +96,7 @@ def judged(
     *,
     held_out_error: float | None,
 ) -> Trust:
-    """Return the verdict on a solution that has its standard deviations; arguments as for `assessed`."""
+    """Return the verdict on a solution with standard deviations; arguments as for `assessed`."""
     return assess(
         solution.shapes,
         solution.camera.rotations,

@@ -1,14 +1,14 @@
-"""Observations that were held out: how far cameras and prior miss images that they predict from the other images of a point.
+"""Cross-validation: the error with which cameras and prior predict held-out images of a point from its other images.
 
-Given cameras Π and prior covariance Σ, the images w ∈ R^{2N} of a point in the N frames that show it are N(0, V), V = Π Σ Πᵀ + σ² W⁻¹. The
-prediction of a block B of them from all others is off by
+Given cameras Π and prior covariance Σ, the images w ∈ R^{2N} of a point in the N frames that show it are N(0, V), V = Π Σ Πᵀ + σ² W⁻¹.
+Predicting a block B of them from all others has the error
 
     e_B = [V⁻¹]_BB⁻¹ [V⁻¹ w]_B,    with covariance [V⁻¹]_BB⁻¹,
 
-which is the result of a solve without B at the cost of one with it (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006,
-equations 5.10 to 5.12, here for blocks). A block is a tenth of the frames in a row, since one frame of a film follows from its neighbours
-even where the model is wrong. Residuals of the solve do not show this: a model with as many modes as frames fits anything, white noise to
-4 % of its size, and predicts none of it.
+the same as a solve without B, but without repeating the solve for each block (Rasmussen and Williams, Gaussian Processes for Machine
+Learning, 2006, equations 5.10 to 5.12, here for blocks). A block is a tenth of the frames, consecutive, because a single frame of a film
+is easily interpolated from its neighbours even if the model is wrong. Residuals of the solve cannot replace this test: a model with as many
+modes as frames fits even white noise to 4 % of its size, and predicts none of it.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from pliant.solver.tracks.noise import weighted_median
 from scipy import linalg
 
 MAX_HELD_OUT_FRAMES, MAX_HELD_OUT_POINTS = 100, 40
-"""Maximum numbers of frames, evenly spread, and of points, spread by their distance from the centroid. The cost is cubic in frames: each
-pattern of visibility takes some 5 ms."""
+"""Maximum numbers of frames, evenly spread, and of points, spread by their distance from the centroid. The cost is cubic in frames: about
+5 ms for each visibility pattern."""
 
 FOLDS = 10
-"""Blocks of frames that are held out in turn; fewer frames are held out one by one."""
+"""Number of blocks of frames that are held out in turn; sequences of fewer frames hold out single frames."""
 
 LEAST_CONFIDENCE = 1e-3
-"""Observations with less confidence count as hidden."""
+"""Confidence below which an observation counts as hidden."""
 
 
 def held_out_errors(covariance: Floats, images: Floats, blocks: list[NDArray[np.intp]]) -> Floats:
-    """Return observed minus predicted images, each predicted without those of its block; 0 outside all blocks.
+    """Return observed minus predicted images, each predicted without the images of its block; 0 outside all blocks.
 
     Parameters
     ----------
     covariance : ndarray, shape (2N, 2N)
-        V, the coordinates of an image side by side.
+        V, with the two coordinates of an image adjacent.
     images : ndarray, shape (K, N, 2)
-        Of K points with the same V.
+        Images of K points with the same V.
     blocks : list of ndarray
-        Indices of images.
+        Image indices of each block.
 
     Raises
     ------
@@ -72,27 +72,27 @@ def held_out_error(
     *,
     unit: float,
 ) -> float | None:
-    """Return the median distance of held-out observations from their prediction, share of the size of the shapes.
+    """Return the median distance of held-out observations from their predictions, relative to the size of the shapes.
 
     Parameters
     ----------
     tracks : Tracks
         F frames of P points.
     shapes : ndarray, shape (F, P, 3)
-        The tracks' unit. They serve to correct the tracks for perspective, and as the unit of the result.
+        In the tracks' unit. Used to correct the tracks for perspective and to normalize the result.
     camera : Camera
-        That sees them.
+        Cameras of the solution.
     confidence : ndarray, shape (F, P)
-        Of the observations that were used; 0 where hidden or rejected.
+        Confidence of the observations used; 0 where hidden or rejected.
     covariance : ShapeCovariance
-        The prior, F frames, normalized units.
+        The prior of all F frames, in normalized units.
     unit : float
         The tracks' unit per normalized unit.
 
     Returns
     -------
     float or None
-        None where no point is seen in three frames, or rounding leaves V indefinite.
+        None if no point is observed in at least three frames and a quarter of those used, or if rounding makes V indefinite.
     """
     frames = len(shapes)
     used = evenly_spread(frames, MAX_HELD_OUT_FRAMES)
@@ -126,14 +126,14 @@ def _errors(image: Floats, noise: float, images: Floats, weights: Floats) -> Flo
 
 
 def _spread(shape: Floats, counts: NDArray[np.intp], frames: int) -> NDArray[np.intp]:
-    """Return points that are observed often, and in three frames at least, spread by their distance from the middle of a frame `(P, 3)`."""
+    """Return well-observed points (in at least three frames), spread by their distance from the centroid of a shape `(P, 3)`."""
     often = np.flatnonzero(counts >= max(3, WELL_OBSERVED_SHARE * frames))
     ordered = often[np.argsort(ranks(shape[None, often] - shape.mean(axis=0)))]
     return np.asarray(ordered[evenly_spread(len(often), MAX_HELD_OUT_POINTS)])
 
 
 def _corrected(points: Floats, shapes: Floats, camera: Camera) -> Floats:
-    """Return tracks `(F, K, 2)` without translation as an orthographic camera would have seen them."""
+    """Return tracks `(F, K, 2)` without translation, corrected to what an orthographic camera would observe."""
     flat = camera.scales[:, None, None] * (shapes @ camera.rotations[:, :2].transpose(0, 2, 1))
     off = points - camera.project(shapes)
     if camera.focal is not None:
@@ -149,7 +149,7 @@ def _image_covariance(covariance: ShapeCovariance, camera: Camera, used: NDArray
 
 
 def _blocks(seen: NDArray[np.intp], frames: int) -> list[NDArray[np.intp]]:
-    """Return the indices into `seen` of the images in each tenth of the frames; none where it has all of them."""
+    """Return the indices into `seen` of the images in each tenth of the frames, omitting a block that contains all images."""
     fold = seen * min(FOLDS, frames) // frames
     blocks = [np.flatnonzero(fold == each) for each in np.unique(fold)]
     return [block for block in blocks if len(block) < len(seen)]

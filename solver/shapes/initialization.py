@@ -15,16 +15,16 @@ from pliant.solver.records import Floats
 from pliant.solver.shapes.irls import inner_precision
 
 EXACT, ROUGH, MAX_START_ITERATIONS = 1e-4, 0.1, 200
-"""Reduction of the residual for a final least-squares result, for a starting point, and maximum number of iterations."""
+"""Reduction of the residual for a final least-squares result and for a starting point; maximum number of iterations."""
 
 START_NOISE_STD = 0.1
 """Noise standard deviation, normalized units, assumed for the starting point with a Gaussian prior."""
 
 
 def pseudo_inverse(problem: Problem, translations: Floats) -> Array:
-    """Return R†(W − t) per frame: flat shapes in the image plane of their frame, hidden points at the centre.
+    """Return R†(W − t) per frame: flat shapes in the image plane of each frame, with hidden points at the centre.
 
-    These are the shapes of least norm that explain the tracks (Dai, Deng, He 2017, Fig. 1, first column).
+    These are the minimum-norm shapes that explain the tracks (Dai, Deng, He 2017, Fig. 1, first column).
     """
     target = (problem.points - translations[:, :, None]) * (problem.confidence > 0)[:, None]
     inverse = np.linalg.pinv(problem.projections.astype(np.float64))
@@ -35,16 +35,16 @@ def pseudo_inverse(problem: Problem, translations: Floats) -> Array:
 def uniform_solution(problem: Problem, translations: Floats, *, should_stop: Callable[[], bool] | None = None) -> Array:
     """Return the least-squares shapes with equal weights for all observations (eq. 5 if λ2 is 0).
 
-    Minimises ‖W − R S‖² + λ1 ‖H S‖² + λ2 ‖A S‖²: the result for least squares, and a starting point for robust losses.
-    With a Gaussian prior the starting point assumes large noise (`START_NOISE_STD`), because shapes that follow an
-    outlier would give it full weight and the reweighting would be slow to reject it. `should_stop` is called in every iteration; once it
-    returns True, the shapes so far are returned, those of one iteration at least.
+    They minimise ‖W − R S‖² + λ1 ‖H S‖² + λ2 ‖A S‖²: the result for least squares, the starting point for robust losses.
+    With a Gaussian prior the starting point assumes large noise (`START_NOISE_STD`): shapes that fit an outlier give it full weight,
+    and reweighting would reject it only slowly. `should_stop` is called in every iteration; once it returns True, the shapes so far are
+    returned, after at least one iteration.
     """
     asked, tick = count(), should_stop if should_stop is not None else bool
     tick()
 
     def stops() -> bool:
-        before = next(asked)  # asked twice before the first iteration ends
+        before = next(asked)  # called twice before the first iteration ends
         return should_stop is not None and should_stop() and before > 1
 
     reduction = EXACT if problem.loss == "l2" else ROUGH
@@ -63,7 +63,7 @@ def uniform_solution(problem: Problem, translations: Floats, *, should_stop: Cal
 
 
 def _uniform(problem: Problem, reduction: float) -> Operator:
-    """Return the normal equations with equal weights, in the precision that attains the reduction."""
+    """Return the normal equations with equal weights, in a precision that allows the reduction."""
     weights = np.array(np.broadcast_to(problem.confidence[:, None, :], problem.points.shape))
     if problem.quadratic is not None and problem.weights.temporal > 0:
         weights *= weights.dtype.type(problem.weights.temporal / START_NOISE_STD**2)

@@ -7,9 +7,9 @@ the area A that the tracks cover about their frames' centroids. With a share α 
 
 For an observation of confidence v the density is p(r) = v² / (2 s²) exp(−√2 v (|r_x| + |r_y|) / s) with the loss `l1`, whose smoothed
 absolute value is the negative logarithm of a Laplace density of standard deviation s, and p(r) = v / (2π s²) exp(−v |r|² / 2s²) with
-the other losses. s is the standard deviation of the noise that the solve used (`Choices.noise`), or that of the residuals if that is
-larger because the model does not fit: their median length, weighted by confidence, over √(2 ln 2). α = (n + 1) / (N + 2) for n of N visible
-observations rejected, the mean under a uniform prior (Laplace's rule of succession).
+the other losses. s is the larger of two standard deviations: that of the noise assumed by the solve (`Choices.noise`), and that of the
+residuals, which exceeds it if the model does not fit: their confidence-weighted median length over √(2 ln 2). If n of N visible
+observations are rejected, α = (n + 1) / (N + 2), the mean under a uniform prior (Laplace's rule of succession).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def with_inlier_probability(
     loss: str,
     should_stop: Callable[[], bool] | None = None,
 ) -> Solution:
-    """Return the solution with the probability of every observation.
+    """Return the solution with the inlier probability of every observation.
 
     Parameters
     ----------
@@ -48,13 +48,13 @@ def with_inlier_probability(
     tracks : Tracks
         All observations.
     confidence : ndarray, shape (F, P)
-        Of the observations that were used; 0 where rejected.
+        Confidence of the observations used; 0 where rejected.
     full_confidence : float
         Confidence of the tracks that counts as 1.
     loss : {"l1", "l2", "huber"}
-        Of the data term.
+        Loss of the data term.
     should_stop : callable, optional
-        Called between units of work, for their progress; the result is complete whatever it returns.
+        Called between units of work to report progress; its result is ignored.
     """
     tick = should_stop if should_stop is not None else bool
     seen = tracks.visible > 0
@@ -82,7 +82,7 @@ def with_inlier_probability(
 def inlier_probability(
     left: Floats, confidence: Floats, rejected: np.ndarray, *, noise_std: float, extent: Floats, loss: str
 ) -> Floats:
-    """Return the probability of every observation, shape `(F, P)`: 0 where rejected, NaN where hidden.
+    """Return the inlier probability of every observation, shape `(F, P)`: 0 where rejected, NaN where hidden.
 
     Parameters
     ----------
@@ -93,11 +93,11 @@ def inlier_probability(
     rejected : ndarray of bool, shape (F, P)
         Visible observations that were not used.
     noise_std : float
-        Standard deviation of an image coordinate, the unit of the residuals.
+        Standard deviation of an image coordinate, in the unit of the residuals.
     extent : ndarray, shape (2,)
-        Width and height of the area that outliers lie in, the same unit.
+        Width and height of the area of the outliers, in the same unit.
     loss : {"l1", "l2", "huber"}
-        Density of the inliers.
+        Selects the density of the inliers.
     """
     seen, found = confidence > 0, np.full(confidence.shape, np.nan)
     used = seen & ~rejected
@@ -110,7 +110,7 @@ def inlier_probability(
     typical = weighted_median(lengths, confidence[used]) / MEDIAN_LENGTH
     del lengths
     scale = max(noise_std, typical, float(np.finfo(float).tiny) ** 0.25)
-    area = float(np.prod(np.asarray(extent) / scale + 1))  # in units of s²; an extent of 0 has the size of the noise
+    area = float(np.prod(np.asarray(extent) / scale + 1))  # in units of s²; adding 1 keeps an extent of 0 positive
     odds = (seen.sum() - rejected.sum() + 1) / (rejected.sum() + 1)
     for some in frame_chunks(*used.shape):
         chosen = used[some]
@@ -120,7 +120,7 @@ def inlier_probability(
 
 
 def _log_density(residual: Floats, weight: Floats, loss: str) -> Floats:
-    """Return the logarithm of the density of residuals `(N, 2)`, units of s, with confidences `(N,)`."""
+    """Return the log density of residuals `(N, 2)`, in units of s, with confidences `(N,)`."""
     if loss == "l1":
         logs = 2 * np.log(weight) - np.log(2) - np.sqrt(2) * weight * np.abs(residual).sum(axis=1)
     else:

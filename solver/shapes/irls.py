@@ -1,7 +1,7 @@
 """Iteratively reweighted least squares, as pure functions on a State: init → step → terminate.
 
-Majorise–minimise: the loss and the rank prior are replaced by quadratics that majorise them, and a few warm-started
-conjugate gradient iterations decrease the sum. The energy cannot increase, however few iterations are run.
+Majorise–minimise: quadratics majorise the loss and the rank prior, and a few warm-started conjugate gradient iterations
+decrease their sum. The energy cannot increase, however few iterations are run.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from pliant.solver.solution import Outcome
 from pliant.solver.threads import SMALLEST, over_ranges
 
 INNER_REDUCTION = 0.1
-"""Largest factor by which an inner solve reduces the residual; the weights change next, so more is wasted."""
+"""Largest relative residual at which an inner solve ends; more accuracy would be wasted, since the weights change next."""
 NEGLIGIBLE = 0.1
-"""What an inner solve may leave to gain, as a share of what ends the reweightings."""
+"""Decrease of the energy that an inner solve may leave, relative to the decrease that ends the reweightings."""
 MAX_INNER = 60
 """Maximum number of conjugate gradient iterations per reweighting."""
 SINGLE_REDUCTION = 1e-3
-"""Smallest reduction of the residual for which single precision is used."""
+"""Smallest relative residual of an inner solve, and the smallest for which single precision is used."""
 
 
 def init(problem: Problem, shapes: Array, translations: Floats) -> State:
@@ -49,12 +49,12 @@ def step(
 ) -> State:
     """Do one reweighting: shapes for the weights of `state`, then translations, then new weights.
 
-    Conjugate gradients solve for the correction to the shapes, which needs one or two digits only, so single precision
-    is enough where `inner_precision` allows it. Gradient, sum and energy keep the problem's precision.
+    Conjugate gradients solve for the correction to the shapes. It needs only one or two digits, so single precision is
+    enough where `inner_precision` allows it. Gradient, sum and energy keep the problem's precision.
 
-    The reduction of the residual, unless given, is the share of the last decrease that the quadratic majoriser did not
-    predict (Eisenstat, Walker 1996, choice 1): weights that hardly change make an accurate solution worthwhile. It ends
-    where a negligible part of `tolerance`, relative to the energy, is left to gain.
+    `reduction` defaults to the share of the last decrease that the quadratic majoriser did not predict (Eisenstat,
+    Walker 1996, choice 1): if the weights hardly change, an accurate solution is worthwhile. The inner solve also ends
+    once its remaining decrease is negligible compared with `tolerance` times the energy.
     """
     reduction = state.reduction if reduction is None else reduction
     operator = operator_at(problem, state)
@@ -87,10 +87,10 @@ def _downhill(problem: Problem, state: State, operator: Operator) -> Array:
 
 
 def inner_precision(operator: Operator, reduction: float) -> np.dtype[np.floating]:
-    """Return single precision if it attains the reduction and the equations are well enough conditioned, else double.
+    """Return single precision if it can reach the reduction and the equations are well conditioned, else the operator's.
 
-    The Gaussian prior spans ten orders of magnitude: its tridiagonal part is very stiff, and the precision of its modes
-    is a small difference from it.
+    The Gaussian prior needs double precision because it spans ten orders of magnitude: its tridiagonal part is very stiff,
+    and the precision along its modes is a small difference of large numbers.
     """
     if operator.quadratic is not None:
         return operator.weights.dtype
@@ -113,10 +113,9 @@ def operator_at(problem: Problem, state: State) -> Operator:
 
 
 def terminate(before: State, after: State, *, tolerance: float, max_reweightings: int) -> Outcome | None:
-    """Return the outcome of the solve, or None to continue; `after` is the step before `no_higher`.
+    """Return the outcome of the solve, or None to continue; `after` is the step before `no_higher` is applied.
 
-    Converged if the relative change of the objective over one reweighting is below `tolerance`, rejected if it rises by
-    more.
+    Converged if the objective changes by at most `tolerance`, relative, over one reweighting; rejected if it rises by more.
     """
     if after.objective - before.objective > tolerance * abs(before.objective):
         return Outcome.REJECTED
@@ -137,10 +136,10 @@ def no_higher(before: State, after: State) -> State:
 def _evaluated(
     problem: Problem, shapes: Array, translations: Floats, omega: Array | None, *, reweighting: int
 ) -> State:
-    """Centre every frame's shape, in place, and return the state there; without `problem.moving` translations and centres stay.
+    """Centre every frame's shape, in place, and return its state; without `problem.moving`, keep translations and centres.
 
-    The translation compensates the shift: the data term and AX are unchanged (rows of A sum to 0), and ‖HX‖ and the rank
-    penalty cannot increase. With weights ω, the translations are first fitted to the residuals.
+    The translation compensates for the shift: the data term and AX are unchanged (rows of A sum to 0), and ‖HX‖ and the rank
+    penalty cannot increase. If weights ω are given, the translations are first fitted to the residuals.
     """
     frames, kind = len(shapes), shapes.dtype.type
     translations, losses = translations.copy(), np.full(frames, np.inf)

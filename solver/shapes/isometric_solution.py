@@ -1,8 +1,8 @@
-"""A Solution from an isometric surface: camera axes become cameras that move around shapes in one world.
+"""A Solution from an isometric surface: surfaces in camera axes become shapes in world axes and moving cameras.
 
-The surface is known in each frame's camera axes. A rigid motion per frame brings it onto the mean shape (generalised Procrustes analysis;
-Gower 1975), so that what is left between frames is deformation and what was taken out is the camera's rotation. Shapes are in image units
-at the mean depth, as under scaled orthography.
+The surface is known in each frame's camera axes. A rigid motion per frame aligns it with the mean shape (generalised Procrustes analysis;
+Gower 1975): the rotation becomes the camera's, and the remaining differences between frames are deformation. Shapes are in image units at
+the mean depth, as under scaled orthography.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pliant.solver.settings import Settings
 from pliant.solver.solution import Outcome, Solution, Trace
 
 ALTERNATIONS = 5
-"""Alternations between mean shape and rotations; each starts from the last, and the third changes angles by less than 1e-3 already."""
+"""Alternations between mean shape and rotations, each starting from the last; the third already changes angles by less than 1e-3."""
 
 
 def isometric_solution(
@@ -30,22 +30,22 @@ def isometric_solution(
     seconds: dict[str, float],
     stopped: bool = False,
 ) -> Solution:
-    """Return the solution that an accepted verdict stands for.
+    """Return the solution for an accepted verdict.
 
     Parameters
     ----------
     tracks : Tracks
-        What the surface was computed from.
+        The tracks that the surface was computed from.
     verdict : IsometricVerdict
-        With a surface, from tracks whose y grows downwards.
+        Contains a surface, computed from tracks with y down.
     settings : Settings
         `y_up` of the tracks, and whether the focal length was given.
     unit : float
-        RMS radius of the centred tracks, reported with the choices.
+        RMS radius of the centred tracks, reported in the choices.
     seconds : dict
         Wall time per stage.
     stopped : bool
-        Whether the refinement of the surface was cut short.
+        Whether the refinement of the surface was stopped early.
     """
     surface = verdict.surface
     assert surface is not None
@@ -73,7 +73,7 @@ def isometric_solution(
 def _trust(
     verdict: IsometricVerdict, camera: Camera, shapes: Floats, *, residual: float, hidden: float, ordered: bool
 ) -> Trust:
-    """Return the verdict without an expected error: isometry is no Gaussian model and has no posterior."""
+    """Return the verdict without an expected error: isometry is not a Gaussian model, so there is no posterior."""
     grade = Verdict.WITH_CARE if verdict.warnings else Verdict.GOOD
     turning, deforming = per_frame(shapes, camera.rotations) if ordered else (None, None)
     return Trust(
@@ -83,7 +83,7 @@ def _trust(
 
 
 def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera]:
-    """Return shapes `(F, P, 3)`, centred, and the cameras that see them where the surface was."""
+    """Return centred shapes `(F, P, 3)` in world axes, and cameras that reproduce the images of the surface."""
     origin = surface.points.mean(axis=1)
     centred = surface.points - origin[:, None]
     rotations = _rotations(centred[:, surface.placed])
@@ -98,18 +98,18 @@ def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera]:
 
 
 def downwards(tracks: Tracks) -> Tracks:
-    """Return tracks with the other direction of y."""
+    """Return the tracks with y reversed."""
     return Tracks.from_arrays(tracks.points * (1.0, -1.0), tracks.visible)
 
 
 def centre_downwards(settings: Settings) -> tuple[float, float] | None:
-    """Return the given principal point, or the centre of the picture, where y grows downwards; None if neither is given."""
+    """Return the given principal point or the image centre, with y down; None if neither is known."""
     point = settings.centre
     return point if point is None or not settings.y_up else (point[0], -point[1])
 
 
 def upwards(camera: Camera) -> Camera:
-    """Return the same camera for tracks with the other direction of y: half a turn about x."""
+    """Return the camera for the tracks with y reversed: rotated by half a turn about x."""
     half_turn = np.diag([1.0, -1.0, -1.0])
     rotations, translations = half_turn @ camera.rotations, camera.translations * (1.0, -1.0)
     for array in (rotations, translations):
@@ -124,7 +124,7 @@ def upwards(camera: Camera) -> Camera:
 
 
 def _rotations(centred: Floats) -> Floats:
-    """Return camera from world, `(F, 3, 3)`: S_f R_f is nearest to the mean shape; the first is the identity."""
+    """Return rotations R_f, camera from world, `(F, 3, 3)`, that align each S_f R_f with the mean shape; the first is the identity."""
     mean = centred[int(np.square(centred - centred.mean(axis=0)).sum(axis=(1, 2)).argmin())]
     rotations = np.tile(np.eye(3), (len(centred), 1, 1))
     for _ in range(ALTERNATIONS):
@@ -136,16 +136,16 @@ def _rotations(centred: Floats) -> Floats:
 def _choices(verdict: IsometricVerdict, surface: IsometricSurface, unit: float, outliers: float) -> Choices:
     reasons = {
         "surface": verdict.reason,
-        "outliers": f"{outliers:.1%} of what was seen contradicts the surface and was not used.",
+        "outliers": f"{outliers:.1%} of the visible observations contradict the surface and were not used.",
     }
     warnings = list(verdict.warnings)
     if not surface.shown.all():
         count = int((~surface.shown).sum())
         few = f"{count} of {len(surface.shown)} frames show too little of the surface"
-        warnings.append(f"{few}; they have the shapes and cameras of the nearest others.")
+        warnings.append(f"{few}; they have the shapes and cameras of the nearest other frames.")
     if not surface.placed.all():
         share = 1 - float(surface.placed.mean())
-        warnings.append(f"{share:.1%} of the points were never seen on the surface; they lie in its middle.")
+        warnings.append(f"{share:.1%} of the points were never seen on the surface; they are placed at its centre.")
     return Choices(
         basis_size=0, temporal_weight=0.0, spatial_weight=0.0, robust_scale=0.0, temporal_order=1, low_rank_weight=0.0,
         laplacian="none", unit=unit, noise=surface.noise_std, reasons=reasons, warnings=tuple(warnings),

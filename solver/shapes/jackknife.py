@@ -1,15 +1,14 @@
-"""How far the shapes depend on which points cameras and prior were learned from: a jackknife over parts of the object.
+"""Uncertainty from learning: a jackknife over parts of the object, since other points would give other cameras and priors.
 
-The posterior of `shapes.uncertainty` takes cameras and prior covariance as known. Both are estimated from the same tracks: where points
-are few, frames many, or the motion is ambiguous, other points would have led to other shapes. The jackknife measures this. Each of K
-compact parts of the object is left out in turn, covariance and cameras are refined from the other points, and the shapes of all points
-are computed again.
-With x₍ₖ₎ the shapes without part k, x those refined from all points, and x̄ the mean of the x₍ₖ₎,
+The posterior of `shapes.uncertainty` takes cameras and prior covariance as known. Both are estimated from the same tracks: with few points,
+many frames or ambiguous motion, other points would have led to other shapes. The jackknife measures this. It leaves out each of K compact
+parts of the object in turn, refines covariance and cameras from the other points, and recomputes the shapes of all points.
+With x₍ₖ₎ the shapes without part k, x the shapes refined from all points, and x̄ the mean of the x₍ₖ₎,
 
     variance = (K − 1)/K Σₖ (x₍ₖ₎ − x̄)²,    bias = (K − 1) (x̄ − x),
 
-after a rotation per frame, which `e3d_frame` leaves free. Parts are compact because neighbouring points move alike: with scattered points
-left out, their neighbours would stand for them (Künsch 1989, "The jackknife and the bootstrap for general stationary observations").
+after aligning each frame by a rotation, as the error measure `e3d_frame` does. Parts are compact because neighbouring points move alike:
+the neighbours of scattered points would replace them (Künsch 1989, "The jackknife and the bootstrap for general stationary observations").
 The sum of posterior variance, variance and squared bias is the corrected variance of empirical Bayes (Laird and Louis 1987, "Empirical
 Bayes confidence intervals based on bootstrap samples").
 """
@@ -33,46 +32,46 @@ from pliant.solver.tracks.frame_selection import between, evenly_spread
 from scipy.spatial import cKDTree
 
 PARTS = 6
-"""K. More parts cost more; with 3 parts the dance has .063 instead of .115 (true .102)."""
+"""K. More parts cost more; with 3 parts the estimated error of the dance sequence is .063 instead of .115 (true error .102)."""
 
 MAX_JACKKNIFE_FRAMES = 100
-"""Maximum number of frames, evenly spread; the others are interpolated."""
+"""Maximum number of frames evaluated, evenly spread; the others are interpolated."""
 
 LEARNING_ROUNDS, TURNING_ITERATIONS = 20, 60
-"""Rounds of expectation maximisation and L-BFGS iterations of a refinement. One that ends before the minimum understates the change: with 5
-and 15 the dance has .070."""
+"""Iterations of expectation maximisation and of L-BFGS in each refinement. Ending before the minimum understates the change: with 5 and 15,
+the estimated error of the dance sequence is .070."""
 
 MIN_LEARNED_POINTS = 4
 """Minimum number of points to learn from."""
 
 CLUSTERING = 5
-"""Rounds of k-means for the parts."""
+"""Iterations of k-means for the parts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Changes:
-    """How far positions change by what cameras and prior were learned from, at some points of the object."""
+    """Standard deviation of positions due to the choice of points from which cameras and prior are learned, at sampled points."""
 
     std: Floats | None
-    """Root mean squared change of the points, shape `(F, S)`, normalized units; None: 0 everywhere."""
+    """Root mean squared change of the sampled points, shape `(F, S)`, normalized units; None means 0 everywhere."""
 
     points: Floats
-    """Their mean positions, shape `(S, 3)`, world axes, normalized units."""
+    """Mean positions of the sampled points, shape `(S, 3)`, world axes, normalized units."""
 
     bounded: bool = True
-    """False: nothing is known about depth, so every position is as uncertain as the object is large."""
+    """False if depth is unbounded: every position then has its distance from the centre as standard deviation."""
 
     def std_of(self, shapes: Floats, unit: float, *, centred: bool = True) -> Floats:
-        """Return that of every position, shape `(F, P)`; each point takes the value of the nearest one.
+        """Return the standard deviation of every position, shape `(F, P)`; each point takes the value of the nearest sampled one.
 
         Parameters
         ----------
         shapes : ndarray, shape (F, P, 3)
             World axes.
         unit : float
-            One normalized unit, the unit of the shapes and of the result.
+            One normalized unit in the unit of the shapes and the result.
         centred : bool
-            False: the object's centre is the origin, and not the mean of these points.
+            Whether the object's centre is the mean of these points; otherwise it is the origin.
         """
         middle = shapes.mean(axis=1) if centred else np.zeros((len(shapes), 3))
         if not self.bounded:
@@ -90,16 +89,16 @@ def learning_changes(
     turning: bool,
     should_stop: Callable[[], bool] | None = None,
 ) -> Changes:
-    """Return how far positions change by what cameras and prior were learned from.
+    """Return how far positions change with the points from which cameras and prior are learned.
 
     Parameters
     ----------
     estimate : CameraEstimate
-        With the sample of the (corrected) tracks.
+        Contains a sample of the (corrected) tracks.
     covariance : ShapeCovariance
-        Of all F frames, in the axes of the estimate.
+        Prior of all F frames, in the axes of the estimate.
     turning : bool
-        False keeps the cameras.
+        Whether to refine the cameras too.
     should_stop : callable, optional
         Called between refinements; once it returns True, the changes are 0.
     """
@@ -123,7 +122,7 @@ def learning_changes(
                 return nothing
             if (part_of != part).sum() >= MIN_LEARNED_POINTS:
                 without.append(_onto(_shapes_from(sample, part_of != part, start, turning), everything))
-    except np.linalg.LinAlgError:  # depth without bounds
+    except np.linalg.LinAlgError:  # depth is unbounded
         return replace(nothing, bounded=False)
     if len(without) < 2:
         return nothing
@@ -134,7 +133,7 @@ def learning_changes(
 
 
 def parts(sample: Floats) -> NDArray[np.intp]:
-    """Return the compact part of the object that every point of `sample (F, S, 2)` belongs to: k-means of paths, started far apart."""
+    """Return the index of the compact part of each point of `sample (F, S, 2)`: k-means of paths, starting from distant ones."""
     paths = sample.transpose(1, 0, 2).reshape(sample.shape[1], -1)
     first = int(np.square(paths - paths.mean(axis=0)).sum(axis=1).argmax())
     middles, nearest = [paths[first]], np.square(paths - paths[first]).sum(axis=1)
@@ -151,7 +150,7 @@ def parts(sample: Floats) -> NDArray[np.intp]:
 
 
 def _mean_squared_change(without: Floats, everything: Floats) -> Floats:
-    """Return variance plus squared bias, shape `(F, S)`, of shapes `(K, F, S, 3)` against those from all points."""
+    """Return variance plus squared bias, shape `(F, S)`, of shapes `(K, F, S, 3)` relative to the shapes from all points."""
     count = len(without)
     mean = without.mean(axis=0)
     variance = (count - 1) / count * np.square(without - mean).sum(axis=(0, 3))
@@ -160,7 +159,7 @@ def _mean_squared_change(without: Floats, everything: Floats) -> Floats:
 
 
 def _shapes_from(sample: Floats, kept: NDArray[np.bool_], start: Learned, turning: bool) -> Floats:
-    """Return posterior mean shapes `(F, S, 3)` in camera axes under cameras and covariance refined from some of the points."""
+    """Return posterior mean shapes `(F, S, 3)` in camera axes, with cameras and covariance refined from the points kept."""
     rows = columns(sample[:, kept])
     gram = rows @ rows.T / rows.shape[1]
     projections = start.rotations[:, :2] * start.scales[:, None, None]
@@ -175,7 +174,7 @@ def _shapes_from(sample: Floats, kept: NDArray[np.bool_], start: Learned, turnin
 
 
 def _onto(shapes: Floats, others: Floats) -> Floats:
-    """Return the shapes, each frame centred and rotated onto the other's."""
+    """Return the shapes with each frame centred and rotated onto the same frame of `others`."""
     moved, fixed = centred(shapes), centred(others)
     turns = procrustes(fixed.transpose(0, 2, 1) @ moved, proper=True)
     return np.asarray(moved @ turns.transpose(0, 2, 1))

@@ -1,8 +1,8 @@
 """Rejection of gross outliers before the shapes are fitted.
 
-With a loss of slope 1, an outlier of one RMS radius costs as much as the noise of a hundred good observations, so a prior weighted for
-the noise follows outliers. They are therefore left out: every observation that its point's other observations, the cameras and the
-learned covariance make less probable than an outlier (`model.observation_model`).
+With a loss of slope 1, an outlier of one RMS radius costs as much as the noise of a hundred good observations, so shapes under a prior
+weighted for the noise follow outliers. An observation is therefore rejected if it is more probably an outlier than not, given the other
+observations of its point, the cameras and the learned covariance (`model.observation_model`).
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ def gross_outliers(
     Parameters
     ----------
     flat : Normalized
-        Tracks, corrected for perspective.
+        Tracks corrected for perspective.
     projections : array, shape (F, 2, 3)
         s_f times the first two rows of R_f.
     translations : array, shape (F, 2)
-        Of the cameras, normalized units.
+        Translations of the cameras, normalized units.
     covariance : ShapeCovariance
-        Of all frames.
+        Prior of all frames.
     filling : Filling
-        The completion, from whose outliers the search starts.
+        Model of the completed tracks; its outliers initialise the search.
     share : float
-        Share of outliers, estimated.
+        Estimated share of outliers.
     should_stop : callable, optional
-        Called between chunks; once it returns True, what was found so far is returned.
+        Called between chunks; once it returns True, the outliers found so far are returned.
     """
     found = np.zeros(flat.visible.shape, dtype=bool)
     frames = len(projections)

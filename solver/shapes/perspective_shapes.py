@@ -1,4 +1,4 @@
-"""Shapes under perspective: tracks corrected with the depths of the shapes found, and cameras that project to pixels."""
+"""Shapes under perspective: correct the tracks with the estimated depths, and return cameras that project to pixels."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def corrected_again(
     Parameters
     ----------
     problem, state
-        Of the points `kept`, all of them for None.
+        Problem and state of the points `kept`.
     normalized, flat : Normalized
-        The tracks as they are, and as they were corrected so far.
+        The original tracks, and their latest correction.
     estimate : CameraEstimate
-        With κ and the cameras.
+        κ and the cameras.
     kept : array of int, optional
-        Points of the problem; the others keep the correction that they have.
+        Points of the problem, None for all; the others keep their correction.
     """
     view = estimate.perspective
     assert view is not None
@@ -55,10 +55,10 @@ def corrected_again(
 def seen_in_perspective(
     solution: Solution, tracks: Tracks, view: Perspective, unit: float, kept: NDArray[np.intp] | None
 ) -> Solution:
-    """Return the solution with a camera that projects to the tracks as they are, and residuals measured there.
+    """Return the solution with a camera that projects to the original tracks, and residuals relative to these.
 
-    Tracks were corrected with depths relative to the mean of the points `kept`; shapes may be centred on the mean of all points. With c the
-    depth of one beyond the other, 1 + κ(z + c) = (1 + κc)(1 + κz/(1 + κc)): scales and translations are divided by 1 + κc.
+    Tracks were corrected with depths relative to the mean of the points `kept`, but shapes may be centred on the mean of all points. With c
+    the difference in depth, 1 + κ(z + c) = (1 + κc)(1 + κz/(1 + κc)), so scales and translations are divided by 1 + κc.
     """
     camera = replace(solution.camera, principal_point=np.array(view.principal_point), y_up=view.signs[0] < 0)
     if not view.bends:

@@ -26,8 +26,8 @@ def build_problem(
     settings: Settings,
     covariance: ShapeCovariance | None = None,
 ) -> tuple[Problem, Choices]:
-    """Return the energy and the choices for settings that are automatic; a covariance makes the prior Gaussian."""
-    # The Gaussian prior is a small difference of large numbers, which single precision cannot represent in stiff fits.
+    """Return the energy and the values chosen for automatic settings; a covariance makes the prior Gaussian."""
+    # The Gaussian prior is a small difference of large numbers: too small for single precision in stiff fits.
     kind = np.dtype(settings.precision if covariance is None else "float64")
     laplacian = _laplacian(normalized, mesh, settings)
     weights, noise, reasons = choose_weights(normalized, covariance, laplacian, settings)
@@ -61,7 +61,7 @@ def build_problem(
 def with_bending(
     problem: Problem, choices: Choices, state: State, settings: Settings, *, bending: float | None = None
 ) -> tuple[Problem, Choices, State]:
-    """Return problem and choices with λ2, if the prior is Gaussian and λ2 is automatic: `bending`, or from the current shapes."""
+    """Set λ2 if it is automatic and the prior is Gaussian: to `bending`, or from the bending of the current shapes if None."""
     if problem.quadratic is None or problem.laplacian is None or settings.spatial_weight is not None:
         return problem, choices, state
     modes = problem.quadratic.modes[0].shape[1]
@@ -70,7 +70,7 @@ def with_bending(
     else:
         weight = bending
     problem = replace(problem, weights=replace(problem.weights, spatial=weight))
-    reason = f"{choices.reasons['weights']} λ2 = {weight:.2g} as the surface bends."
+    reason = f"{choices.reasons['weights']} λ2 = {weight:.2g} from the bending of the surface."
     choices = replace(choices, spatial_weight=weight, reasons={**choices.reasons, "weights": reason})
     return problem, choices, init(problem, state.shapes, state.translations)
 
@@ -82,7 +82,7 @@ def _laplacian(normalized: Normalized, mesh: Mesh | None, settings: Settings) ->
 
 
 def _reference(normalized: Normalized) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Return each point's mean image position with depth 0, shape `(P, 3)`, as the reference for cotangent weights."""
+    """Return each point's mean image position with depth 0, shape `(P, 3)`, the reference shape for cotangent weights."""
     total = np.maximum(normalized.visible.sum(axis=0), np.finfo(float).tiny)
     mean = np.einsum("fp,fpc->pc", normalized.visible, normalized.points) / total[:, None]
     return np.concatenate([mean, np.zeros((len(mean), 1))], axis=1)

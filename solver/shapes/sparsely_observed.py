@@ -1,20 +1,19 @@
 """Sparsely observed points: excluded from the minimisation, placed on the surface, moved to their observations.
 
-A sparsely observed point is held by its neighbours and by its prior alone, whose mean is the centre of the body. In
-the minimisation it would approach its neighbours at the pace of diffusion, and in a patch of such points the prior,
-which acts on every point separately, would win. The points are therefore placed in two steps, given the shapes of the
+Only its neighbours and its prior, whose mean is the centre of the body, constrain a sparsely observed point. In the
+minimisation it would approach its neighbours as slowly as diffusion, and in a patch of such points the prior, which acts
+on each point separately, would dominate. The points are therefore placed in two steps, given the shapes of the
 well-observed points:
 
-    1. Close the surface: the unknown positions minimise ‖A X‖² + μ Σ ‖x_i − x_j‖², the second sum over edges. This is a thin plate
-       under tension; without tension, a plate that hangs on an edge continues at its slope without bound.
+    1. Close the surface: the unknown positions minimise ‖A X‖² + μ Σ ‖x_i − x_j‖², with the second sum over edges. This is a thin
+       plate under tension; without tension, a plate attached at one edge only continues its slope without bound.
     2. Move each point to its observations by simple kriging with the plate as trend (Cressie, Statistics for Spatial Data, 1993,
-       section 3.4). Its path about its mean has the learned covariance; the variance of the mean is reduced to stay near the plate.
-       With Σ for both, and K = ΠΣΠᵀ + diag(λ1/ω) over its observations r, the correction is the conditional mean Σ Πᵀ K⁻¹ r.
+       section 3.4). Its path about its mean has the learned covariance; the variance of the mean is reduced to keep it near the plate.
+       With Σ the sum of both and K = ΠΣΠᵀ + diag(λ1/ω), residuals r are corrected by the conditional mean Σ Πᵀ K⁻¹ r.
 
-Where the tracks have gross outliers, they are rejected one by one: the observation that is least probable given the
-others of its point, by the closed form of leave-one-out (Dubrule, "Cross validation of kriging in a unique
-neighborhood", 1983). A single outlier among four observations bends any fit to all of them, but not the leave-one-out
-prediction.
+Gross outliers are rejected one at a time: the observation that is least probable given the other observations of its
+point, by the closed form of leave-one-out (Dubrule, "Cross validation of kriging in a unique neighborhood", 1983). A
+single outlier among four observations distorts any fit to all of them, but not the leave-one-out prediction.
 """
 
 from __future__ import annotations
@@ -37,49 +36,47 @@ from scipy import linalg, sparse
 from scipy.sparse.linalg import splu
 
 WELL_OBSERVED_SHARE = 0.25
-"""Minimum share of the frames in which a well-observed point is visible. On rotating bodies .15 to .35 give about the
-same error."""
+"""Minimum share of the frames that show a well-observed point. On rotating bodies .15 to .35 give about the same error."""
 
 MIN_OUTLIER_DISTANCE = 0.05
-"""Distance from its prediction, normalized units, below which an observation is never rejected."""
+"""Distance from the prediction, normalized units, below which an observation is never rejected."""
 
 MAX_SPARSE_SHARE = 0.5
-"""Share of sparsely observed points above which all points are fitted together, since tracks then start and end
-throughout."""
+"""Share of sparsely observed points above which all points are fitted together, because tracks then start and end throughout."""
 
 TENSION = 1.0
-"""μ, weight of the differences along edges; it acts beyond about three rings of neighbours. On four bodies 1 to 10
-give about the same error; at .01 patches that hang on an edge fly off."""
+"""μ, weight of the differences along edges; effective beyond about three rings of neighbours. On four bodies 1 to 10 give
+about the same error; at .01, patches attached at one edge only diverge."""
 
 SURFACE_RIDGE = 1e-6
-"""Ridge on AᵀA, whose diagonal is about 150: keeps unconnected points at the centre."""
+"""Ridge added to AᵀA, whose diagonal is about 150; it places unconnected points at the centre."""
 
 PATH_RIDGE = 1e-10
-"""Share added to the diagonal of K, against rounding."""
+"""Relative ridge on the diagonal of K, against rounding."""
 
 SMALLEST_WEIGHT = float(np.finfo(np.float64).tiny)
 
 PATH_REWEIGHTINGS = 3
-"""Reweightings of the deviations of a path."""
+"""Reweightings of a point's residuals in kriging."""
 
 MAX_DEVIATION = 5.0
-"""Standard deviations from its leave-one-out prediction beyond which an observation is rejected, if it is also
-further away than `MIN_OUTLIER_DISTANCE`. With 6 % outliers on a galloping horse .25 to .35 without, .06 with
-rejection."""
+"""Distance from the leave-one-out prediction, in standard deviations, beyond which an observation is rejected if it also
+exceeds `MIN_OUTLIER_DISTANCE`. On a galloping horse with 6 % outliers the error is .25 to .35 without rejection, .06 with
+it."""
 
 MEAN_VARIANCE_SHARE = 0.1
-"""Share of the variance of the body's mean positions that a point may deviate from the surface. With all of it, few
-noisy observations leave the depth open: with noise of .01 on a galloping horse .104 at share 1, .072 at .1; .03 to
-.1 are alike."""
+"""Variance of a point's mean position about the surface, relative to that of the body's mean positions. At 1, a few noisy
+observations do not determine depth: on a galloping horse with noise of .01 the error is .104 at 1 and .072 at .1; .03 to
+.1 give about the same error."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WellObserved:
-    """The well-observed points as a sequence of their own."""
+    """The well-observed points as a separate sequence."""
 
     normalized: Normalized
     mesh: Mesh
-    """Faces, or cells of the grid, all of whose corners are well observed."""
+    """Faces or grid cells with well-observed corners only."""
 
     kept: NDArray[np.intp]
     """Indices of the points, ascending."""
@@ -89,7 +86,7 @@ class WellObserved:
 
 
 def well_observed(normalized: Normalized, mesh: Mesh | None) -> WellObserved | None:
-    """Return the well-observed points; None if these are all points or too few, or if there is no mesh."""
+    """Return the well-observed points; None if these are all points, if they are too few, or without a mesh."""
     if mesh is None or (len(mesh.faces) == 0 and mesh.grid is None):
         return None
     count = normalized.visible.shape[1]
@@ -103,18 +100,18 @@ def well_observed(normalized: Normalized, mesh: Mesh | None) -> WellObserved | N
 def place_the_rest(
     part: WellObserved, problem: Problem, covariance: ShapeCovariance, state: State, *, spoiled: bool = False
 ) -> tuple[Problem, State]:
-    """Return the problem without gross outliers and the state of all points; energy and counts are those of `part`.
+    """Return the problem without gross outliers and the state of all points; energy and counts are those of `state`.
 
     Parameters
     ----------
     part : WellObserved
         The well-observed points.
     problem : Problem
-        Of all points, with the Gaussian prior of `covariance`.
+        Problem of all points, with the Gaussian prior of `covariance`.
     covariance : ShapeCovariance
-        Σ of the paths.
+        Prior of the paths.
     state : State
-        Of the points of the part.
+        State of the well-observed points.
     spoiled : bool
         Whether to reject gross outliers.
     """
@@ -136,16 +133,16 @@ def place_the_rest(
 
 
 def close_surface(shapes: Floats, known: NDArray[np.intp], energy: Matrix) -> None:
-    """Place the other points so that ‖E X‖² is least, in place.
+    """Set the unknown points, in place, to the positions that minimise ‖E X‖².
 
     Parameters
     ----------
     shapes : array, shape (F, 3, P)
-        Right at the known points; the others are written to.
+        Positions of the known points; the others are overwritten.
     known : array of int
-        Which points are known.
+        Indices of the known points.
     energy : sparse array, shape (R, P)
-        E: A, and what is to be small besides.
+        E: the rows of A and any other terms to minimise.
     """
     unknown = np.setdiff1d(np.arange(shapes.shape[2]), known)
     matrix = sparse.csc_array(energy, dtype=np.float64)
@@ -158,13 +155,13 @@ def close_surface(shapes: Floats, known: NDArray[np.intp], energy: Matrix) -> No
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kriging:
-    """The conditional mean of a point's path, given its observations and a trend (simple kriging)."""
+    """Simple kriging: the conditional mean of a point's path, given its observations and a trend."""
 
     problem: Problem
     translations: Floats
 
     reach: Floats
-    """Σ Πᵀ, covariance of the path with the observations, shape `(3F, 2F)`."""
+    """Σ Πᵀ, covariance between path and images, shape `(3F, 2F)`."""
 
     image: Floats
     """Π Σ Πᵀ, shape `(2F, 2F)`."""
@@ -174,7 +171,7 @@ class Kriging:
 
     @classmethod
     def of(cls, problem: Problem, covariance: ShapeCovariance, translations: Floats) -> Kriging:
-        """Compute the covariances once for all points."""
+        """Compute the covariances, which all points share."""
         frames, rows = len(problem.points), problem.projections.astype(np.float64)
         moving = covariance.over_frames()
         near = MEAN_VARIANCE_SHARE * (moving.mean() + covariance.axes()[1])
@@ -185,12 +182,12 @@ class Kriging:
         return cls(problem, translations, reach, image, max(covariance.noise_variance, (MIN_OUTLIER_DISTANCE / 3) ** 2))
 
     def left(self, point: int, path: Floats) -> Floats:
-        """Return the residuals of a path `(F, 3, 1)`, shape `(F, 2, 1)`."""
+        """Return the residuals, shape `(F, 2, 1)`, of a point for a path `(F, 3, 1)`."""
         image = np.matmul(self.problem.projections, path) + self.translations[:, :, None]
         return np.asarray(self.problem.points[:, :, point : point + 1] - image, dtype=np.float64)
 
     def moved(self, point: int, confidence: Floats, trend: Floats) -> Floats:
-        """Return the path, `(F, 3, 1)`, given a trend and observations with confidence `(F, 1)`."""
+        """Return the conditional mean path, `(F, 3, 1)`, given a trend and observations with confidence `(F, 1)`."""
         weights = self.problem.weights
         there = np.repeat(confidence[:, 0] > 0, 2)
         if not there.any():
@@ -209,7 +206,7 @@ class Kriging:
     def inconsistent(self, point: int, confidence: Floats, trend: Floats) -> NDArray[np.intp]:
         """Return the frames whose observations are inconsistent with the point's other observations.
 
-        With K = ΠΣΠᵀ + scatter, y = K⁻¹ r and Bᵢ the 2×2 block of K⁻¹ at observation i, the leave-one-out residual is
+        With K = ΠΣΠᵀ + `scatter` I, y = K⁻¹ r and Bᵢ the 2×2 block of K⁻¹ at observation i, the leave-one-out residual is
         Bᵢ⁻¹ yᵢ, and its squared Mahalanobis length is yᵢᵀ Bᵢ⁻¹ yᵢ (Dubrule 1983).
         """
         off, there = self.left(point, trend)[:, :, 0], np.flatnonzero(confidence[:, 0] > 0)
@@ -231,7 +228,7 @@ class Kriging:
 def _fit_observations(
     kriging: Kriging, shapes: Floats, confidence: Floats, points: NDArray[np.intp], *, spoiled: bool
 ) -> None:
-    """Move points to their observations, in place; the confidence of gross outliers is set to 0, in place."""
+    """Move points to their observations and set the confidence of gross outliers to 0, both in place."""
 
     def work(start: int, stop: int) -> None:
         for point in points[start:stop]:
@@ -245,7 +242,7 @@ def _fit_observations(
 
 
 def _differences(mesh: Mesh) -> Matrix:
-    """Return x ↦ x_i − x_j along every edge, shape `(E, P)`."""
+    """Return the matrix of x ↦ x_i − x_j along every edge, shape `(E, P)`."""
     edges = mesh.edges
     rows, ones = np.arange(len(edges)), np.ones(len(edges))
     values, places = np.concatenate([ones, -ones]), (np.concatenate([rows, rows]), edges.T.ravel())
@@ -253,8 +250,8 @@ def _differences(mesh: Mesh) -> Matrix:
 
 
 def mesh_of(mesh: Mesh, kept: NDArray[np.intp]) -> Mesh:
-    """Return the mesh of the kept points, renumbered: a grid with more holes, or the remaining faces."""
-    number = np.full(mesh.num_points + 1, -1, dtype=np.int32)  # the last entry stands for −1, a hole
+    """Return the mesh of the points kept, renumbered: a grid with more holes, or the faces with all corners kept."""
+    number = np.full(mesh.num_points + 1, -1, dtype=np.int32)  # index −1, a hole, selects the last entry
     number[kept] = np.arange(len(kept))
     if mesh.grid is not None:
         return Mesh.from_grid(number[mesh.grid])

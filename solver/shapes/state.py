@@ -1,4 +1,4 @@
-"""State of a minimisation after some reweightings."""
+"""State of the minimisation between reweightings."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pliant.solver.records import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """State of the minimisation after some reweightings."""
+    """Shapes, translations and weights after a number of reweightings."""
 
     shapes: Array
     """X, shape `(F, 3, P)`, centred per frame."""
     translations: Floats
-    """t relative to the tracks' centroids, shape `(F, 2)`."""
+    """t, relative to the tracks' centroids, shape `(F, 2)`, normalized units."""
     omega: Array
-    """IRLS weights of the current residual, shape `(F, 2, P)`."""
+    """IRLS weights for the current residuals, shape `(F, 2, P)`."""
     rank: RankTerm | None
     """Majoriser of the low-rank prior at the current shapes."""
     objective: float
@@ -29,9 +29,9 @@ class State:
     iterations: int
     """Conjugate-gradient iterations of the last step."""
     reduction: float
-    """Factor by which the next inner solve reduces the residual."""
+    """Relative residual at which the next inner solve ends."""
 
     def summary(self) -> State:
-        """Return the numbers without the arrays, for the history."""
+        """Return the state without its arrays, for the history."""
         nothing = np.zeros(0)
         return replace(self, shapes=nothing, omega=nothing, rank=None)

@@ -5,16 +5,16 @@ With cameras Π, noise variance σ²/w for an observation of confidence w, and t
 
     Σ − Σ Πᵀ (Π Σ Πᵀ + σ² W⁻¹)⁻¹ Π Σ,
 
-restricted to the observations that the point has (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006,
-equation 2.24). Under orthography it depends on a point through its pattern of visibility alone. Under perspective with κ = 1/φ the
+restricted to the observations of the point (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006,
+equation 2.24). Under orthography it depends only on the point's visibility pattern. Under perspective with κ = 1/φ the
 image v = w / (1 + κz), relative to the principal point, has the derivative
 
     ∂v/∂x = (s_f R_f[:2] − κ v ⊗ s_f R_f[2]) / (1 + κz),
 
-which replaces Π and differs from point to point; it is evaluated at one representative of each compact part of the object. Patterns of
-visibility of a sample of points are evaluated exactly; from them follows by how much a hidden position is less certain than a visible
-one, as a function of the frames to the nearest observation, and with that the rest is predicted. Cameras are taken as known, so the
-numbers are lower bounds where few frames or little motion leave the cameras uncertain.
+which replaces Π and differs from point to point; it is evaluated at one representative of each compact part of the object. Visibility
+patterns are evaluated exactly for a sample of points. From these the ratio of the variance of a hidden position to that of a visible one
+is estimated, as a function of the number of frames to the nearest observation; it predicts the variances of all other points. Cameras are
+taken as known, so the standard deviations are lower bounds where few frames or little motion leave the cameras uncertain.
 """
 
 from __future__ import annotations
@@ -32,43 +32,43 @@ from scipy import linalg
 from scipy.spatial import cKDTree
 
 MAX_POSTERIOR_FRAMES = 300
-"""Maximum number of frames evaluated, evenly spread, because the cost is cubic in frames. Fewer observations make the
-numbers larger, never smaller."""
+"""Maximum number of frames evaluated, evenly spread, because the cost is cubic in frames. Fewer observations only increase
+the standard deviations."""
 
 MAX_OPERATIONS = 2e10
-"""Maximum floating-point operations spent on patterns of visibility: a few seconds on one core."""
+"""Maximum number of floating-point operations for visibility patterns: a few seconds on one core."""
 
 MAX_PATTERNS = 128
 """Maximum number of patterns evaluated."""
 
 GAPS = (0, 1, 2, 4, 8, 16, 32, np.inf)
-"""Bounds of the classes of positions, in frames to the nearest frame in which the point is visible."""
+"""Bounds of the classes of positions, in frames to the nearest frame that shows the point."""
 
 
 REPRESENTATIVES = 24
-"""Points at which the derivative of a perspective image is evaluated. On a face 3 half-sizes away, the median standard deviation differs by
-3 % from that with a derivative for every point, by 5 % with 8 representatives, and by 23 % with that of orthography."""
+"""Number of points at which the derivative of a perspective image is evaluated. On a face 3 half-sizes away, the median standard deviation
+differs from the one with a derivative for every point by 3 %; by 5 % with 8 representatives, and by 23 % with orthography."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pinhole:
-    """What perspective adds to the derivative of the image."""
+    """Quantities needed for the derivative of a perspective image."""
 
     views: Floats
-    """v, images relative to the principal point, shape `(F, P, 2)`, the unit of the covariance."""
+    """v, images relative to the principal point, shape `(F, P, 2)`, in the unit of the covariance."""
 
     depth_rows: Floats
     """∂z/∂x = ± s_f R_f[2], shape `(F, 3)`."""
 
     depths: Floats
-    """z, shape `(F, P)`, the unit of the covariance."""
+    """z, shape `(F, P)`, in the unit of the covariance."""
 
     curvature: float
-    """κ = 1/φ, its inverse; positive."""
+    """κ = 1/φ, in the inverse unit of the covariance; positive."""
 
     @classmethod
     def of(cls, camera: Camera, shapes: Floats, unit: float) -> Pinhole | None:
-        """Return it for shapes `(F, P, 3)` in the tracks' unit, one normalized unit being `unit`; None for orthographic cameras."""
+        """Build from shapes `(F, P, 3)` in the tracks' unit and the size `unit` of a normalized unit; None for orthographic cameras."""
         if camera.focal is None:
             return None
         away = (-1.0 if camera.y_up else 1.0) * camera.scales[:, None] * camera.rotations[:, 2]
@@ -91,22 +91,22 @@ def position_std(
     pinhole: Pinhole | None = None,
     seed: int = 0,
 ) -> Floats:
-    """Return the posterior standard deviation of every position: the root of the mean squared distance to the truth.
+    """Return the posterior standard deviation of every position: the root of the expected squared distance to the truth.
 
     Parameters
     ----------
     covariance : ShapeCovariance
-        The prior, F frames.
+        The prior of all F frames.
     projections : ndarray, shape (F, 2, 3)
         s_f times the first two rows of R_f.
     confidence : ndarray, shape (F, P)
         Weights of the observations in [0, 1]; 0 means hidden or rejected.
     noise_std : float
-        Standard deviation of an image coordinate, the unit of the covariance.
+        Standard deviation of an image coordinate, in the unit of the covariance.
     pinhole : Pinhole, optional
-        Perspective; None for orthographic cameras.
+        Perspective cameras; None for orthographic ones.
     seed : int
-        Of the sample of patterns.
+        Seed of the random sample of patterns.
 
     Returns
     -------
@@ -138,9 +138,9 @@ def _rows(projections: Floats, pinhole: Pinhole | None, point: int) -> Floats:
 def _representatives(
     pinhole: Pinhole | None, used: NDArray[np.intp], count: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return for every point the number of the representative whose derivative it takes, and the representatives' indices.
+    """Return which representative supplies the derivative of each point, and the representatives' point indices.
 
-    Under orthography all points have the same derivative. Representatives are chosen far apart (Gonzalez 1985), by their images.
+    Under orthography all points have the same derivative. Otherwise representatives with distant image paths are chosen (Gonzalez 1985).
     """
     if pinhole is None:
         return np.zeros(count, dtype=np.intp), np.zeros(1, dtype=np.intp)
@@ -157,10 +157,10 @@ def _representatives(
 
 
 def bounded_by_neighbours(std: Floats, shapes: Floats, visible: Floats) -> Floats:
-    """Bound the standard deviations of sparsely observed points by their surroundings, in place, and return them.
+    """Bound the standard deviations of sparsely observed points by those of their neighbours, in place, and return them.
 
-    Such points are drawn along the surface (`shapes.sparsely_observed`), which the prior of a single path does not know. The
-    nearest point that is observed often lies on the same surface, so its distance bounds how far off the position can be.
+    These points are placed on the surface (`shapes.sparsely_observed`), which the prior of a single path does not model. The
+    nearest well-observed point usually lies on the same surface, so its distance bounds the error of the position.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def bounded_by_neighbours(std: Floats, shapes: Floats, visible: Floats) -> Float
 
 
 def _moments(covariance: ShapeCovariance, projections: Floats, used: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
-    """Return tr Σ_ff (F,), Σ Πᵀ of shape (3F, 2F) and Π Σ Πᵀ (2F, 2F) for the frames used."""
+    """Return tr Σ_ff `(F,)`, Σ Πᵀ `(3F, 2F)` and Π Σ Πᵀ `(2F, 2F)` for the frames used."""
     rows = projections[used].reshape(-1, 3)
     if len(used) == len(projections):
         over_frames = covariance.over_frames()
@@ -195,7 +195,7 @@ def _moments(covariance: ShapeCovariance, projections: Floats, used: NDArray[np.
 
 
 def _variance(prior: Floats, crossed: Floats, image: Floats, weights: Floats, noise: float) -> Floats:
-    """Return the trace of the posterior covariance of each frame's position, shape `(F,)`, for one pattern of visibility."""
+    """Return the trace of the posterior covariance of each frame's position, shape `(F,)`, for one visibility pattern."""
     seen = np.flatnonzero(np.repeat(weights > 0, 2))
     if len(seen) == 0:
         return prior
@@ -216,7 +216,7 @@ def _sample(weights: Floats, seed: int) -> NDArray[np.intp]:
 
 
 def _predicted(everything: Floats, weights: Floats, sample: NDArray[np.intp], exact: Floats) -> Floats:
-    """Return variances `(F, P)`: those evaluated, and for the others the mean ratio to `everything` in their class."""
+    """Return variances `(F, P)`: exact ones for the sample, elsewhere `everything` times the mean ratio of the position's class."""
     kind = np.digitize(_gaps(weights), GAPS[1:])
     rounding = np.finfo(float)
     ratio = exact / np.maximum(everything[:, sample], np.maximum(rounding.eps * exact, rounding.tiny))
@@ -231,7 +231,7 @@ def _predicted(everything: Floats, weights: Floats, sample: NDArray[np.intp], ex
 
 
 def _gaps(weights: Floats) -> Floats:
-    """Return for each position the number of frames to the nearest frame that shows the point; ∞ where none does."""
+    """Return for each position the number of frames to the nearest frame that shows the point; ∞ if none does."""
     frames = len(weights)
     at = np.where(weights > 0, np.arange(frames)[:, None], -np.inf)
     before = np.maximum.accumulate(at, axis=0)

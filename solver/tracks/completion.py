@@ -44,7 +44,7 @@ POINTS_PER_CHUNK = 4096
 """Points projected onto the basis at once; bounds the memory at POINTS_PER_CHUNK·(6F + r²) numbers."""
 
 CHUNKS_PER_TICK = 16
-"""Chunks of the Gram matrix between two calls of `should_stop`: about a second for 100 frames."""
+"""Chunks of the Gram matrix between calls of `should_stop`: about a second for 100 frames."""
 
 MIN_RESIDUAL_SCALE = 0.01
 """Floor of the residual scale, normalized units, in the robust weights (clean tracks get plain least squares) and in the
@@ -63,7 +63,7 @@ class Filling:
     """The low-rank factor from which hidden entries are predicted."""
 
     basis: Floats
-    """Shape `(F, 2, r)`; the last column is the translation."""
+    """Basis M, shape `(F, 2, r)`; the last column is the translation t."""
 
     spread: Floats
     """Covariance of the coefficients, shape `(r − 1, r − 1)`."""
@@ -72,7 +72,7 @@ class Filling:
     """Standard deviation of the residuals, normalized units."""
 
     def outliers(self, points: Floats, weight: Floats) -> NDArray[np.bool_]:
-        """Return which observations `(F, P, 2)` of confidence `(F, P)` are gross outliers, shape `(F, P)`."""
+        """Return a mask of the gross outliers, shape `(F, P)`, in `points (F, P, 2)` of confidence `weight (F, P)`."""
         return _filled(points, weight, self.basis, self.spread, self.scale)[1]
 
 
@@ -90,10 +90,10 @@ class Completed:
     """Centroid of the completed points minus centroid of the visible points, per frame, shape `(F, 2)`."""
 
     rank: int
-    """Columns of the basis, translation included; 0 if nothing was filled."""
+    """Number of columns of the basis, translation included; 0 if nothing was filled."""
 
     outliers: float
-    """Share of the visible entries of the sample, weighted by confidence, that was replaced as outliers."""
+    """Share of the sample's visible entries, weighted by confidence, that were replaced as outliers."""
 
     filling: Filling | None = None
     """The factor that replaced hidden entries and outliers; None if none were replaced."""
@@ -114,9 +114,9 @@ def complete(
     seed : int
         Seed of the sample of points and of the held-out entries.
     rank : int
-        Number of basis columns, from an earlier completion of these tracks; 0 selects it.
+        Number of basis columns, e.g. from an earlier completion of these tracks; 0 selects it.
     should_stop : callable, optional
-        Called after every number of columns that is tried; once it returns True, the best one so far is used.
+        Called after every rank tried, and between chunks of points; once it returns True, the best rank so far is used.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def complete(
     if again < MIN_POINTS:
         raise InvalidInput(
             "too_little_seen", field="visibility", expected=f"at least {MIN_POINTS} points that are visible in two or more frames",
-            got=f"{again}", hint="Check that the visibility is not inverted, and that a point keeps its place from frame to frame.",
+            got=f"{again}", hint="Check that the visibility is not inverted, and that a point has the same index in every frame.",
         )  # fmt: skip
     points, weight = normalized.points[:, chosen], normalized.visible[:, chosen]
     basis, spread, scale = fit_basis(points, weight, random, rank, should_stop=should_stop)
@@ -146,7 +146,7 @@ def seen_again(visible: Floats) -> int:
 
 
 def choose_points(visible: NDArray[np.floating[Any]], random: np.random.Generator) -> NDArray[np.intp]:
-    """Return the sorted indices of at most `MAX_SAMPLE_POINTS` points, half of them visible more often than the median."""
+    """Return sorted indices of at most `MAX_SAMPLE_POINTS` points, half of them visible at least as often as the median."""
     seen = (visible > 0).sum(axis=0)
     usable = np.flatnonzero(seen >= min(2, int(seen.max())))
     if len(usable) <= MAX_SAMPLE_POINTS:
@@ -160,7 +160,7 @@ def choose_points(visible: NDArray[np.floating[Any]], random: np.random.Generato
 def ranks(points: Floats) -> NDArray[np.intp]:
     """Return each point's rank by the sum of its squared distances from the centroid, largest first, shape `(P,)`.
 
-    What is drawn by rank depends neither on the order of the points nor on the image's axes.
+    Random choices by rank depend neither on the order of the points nor on the image's axes.
     """
     nearness = -(points**2).sum(axis=(0, 2))
     return np.argsort(np.argsort(nearness, kind="stable"), kind="stable")
@@ -172,7 +172,7 @@ def fit_basis(
 ) -> tuple[Floats, Floats, float]:  # fmt: skip
     """Return the basis (F, 2, r) with the translation last, the covariance of its coefficients, and the residual scale.
 
-    Without a given rank, the one with the lowest held-out error is selected; a larger one must be better by 2 %.
+    Without a given rank, the rank with the lowest held-out error is selected; a larger rank must reduce it by 2 %.
     """
     frames, count = weight.shape
     held = (random.random(weight.shape)[:, ranks(points)] < HELD_OUT_SHARE) & (weight > 0)
@@ -203,7 +203,7 @@ def fit_basis(
 def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> tuple[Floats, Floats, Floats, float]:
     """Return basis, coefficients (S, r−1), their covariance and the residual scale after `sweeps` robust alternations.
 
-    Weights are those of the Cauchy loss with a scale of three times the median residual.
+    The weights are those of the Cauchy loss with a scale of three times the residual scale.
     """
     coefficients, spread = coefficients_of(points, weight, basis, None, 1.0, sweeps=3)
     scale = MIN_RESIDUAL_SCALE
@@ -234,9 +234,9 @@ def coefficients_of(
     """Return each point's coefficients on the basis, shape (S, r−1), and their covariance, shape (r−1, r−1).
 
     Reweighted least squares with a Gaussian prior. A point visible in few frames determines few of its coefficients;
-    without a prior the others, and with them the hidden positions, are unbounded. The covariance is the second moment
-    over the points, posterior variance included (one EM step); the first estimate comes from damped least squares. Without
-    `with_moment` it is not computed.
+    without a prior the others, and thus the hidden positions, would be unbounded. The covariance is the second moment
+    over the points, posterior variance included (one EM step); the first estimate comes from damped least squares. If
+    `with_moment` is False, an identity matrix is returned instead.
     """
     columns, shift = basis[:, :, :-1], basis[:, :, -1]
     products = np.einsum("fci,fcj->fij", columns, columns).reshape(len(basis), -1)
@@ -258,7 +258,7 @@ def coefficients_of(
 
 
 def _solved(normal: Floats, right: Floats) -> Floats:
-    """Return the solutions of P systems, `(P, n, n)` and `(P, n)`."""
+    """Solve P linear systems with matrices `(P, n, n)` and right-hand sides `(P, n)`."""
     found = np.empty_like(right)
 
     def work(start: int, stop: int) -> None:
@@ -276,10 +276,10 @@ def predict(basis: Floats, coefficients: Floats) -> Floats:
 
 
 def fill(points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: float) -> tuple[Floats, float]:
-    """Return points with hidden entries predicted and outliers replaced, and the share of the visible entries' confidence replaced.
+    """Replace hidden entries and outliers by predictions; also return the replaced share of the visible entries' confidence.
 
     An entry with confidence 0 < c < 1 becomes c times itself plus 1 − c times its prediction: the EM completion of an
-    observation whose noise variance is larger by 1/c.
+    observation whose noise variance is 1/c times as large.
     """
     predicted, wrong = _filled(points, weight, basis, spread, scale)
     trust = np.where(wrong, 0.0, weight)[..., None]
@@ -290,21 +290,21 @@ def fill(points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: f
 def _filled(
     points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: float
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the predictions, shape `(F, P, 2)`, and which visible entries are gross outliers, shape `(F, P)`."""
+    """Return the predictions, shape `(F, P, 2)`, and a mask of the visible gross outliers, shape `(F, P)`."""
     coefficients, _ = coefficients_of(points, weight, basis, spread, scale, sweeps=4, with_moment=False)
     predicted = predict(basis, coefficients)
     return predicted, gross(points, weight, predicted, scale)
 
 
 def gross(points: Floats, weight: Floats, predicted: Floats, scale: float) -> NDArray[np.bool_]:
-    """Return which visible entries are gross outliers given their prediction, shape `(F, S)`."""
+    """Return a mask of the visible entries that are gross outliers given their prediction, shape `(F, S)`."""
     return np.asarray(
         (weight > 0) & (_lengths(points - predicted) > max(MIN_REPLACED_STDS * scale, MIN_OUTLIER_RESIDUAL))
     )
 
 
 def spans(normalized: Normalized, filling: Filling | None) -> Iterator[tuple[NDArray[np.intp], Floats]]:
-    """Yield the completed points in chunks, as indices and positions `(F, n, 2)`; points that are never visible are skipped."""
+    """Yield the completed points in chunks, as indices `(n,)` and positions `(F, n, 2)`; skip points that are never visible."""
     count = normalized.visible.shape[1]
     for start in range(0, count, POINTS_PER_CHUNK):
         span = slice(start, min(start + POINTS_PER_CHUNK, count))
@@ -319,7 +319,7 @@ def spans(normalized: Normalized, filling: Filling | None) -> Iterator[tuple[NDA
 def _carry(
     normalized: Normalized, filling: Filling | None, chosen: NDArray[np.intp], tick: Callable[[], bool] | None
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the Gram matrix, translations and centred sample of all points, completed chunk by chunk; `tick` is only called."""
+    """Return Gram matrix, translations and centred sample, completed chunk by chunk; call `tick`, but ignore its result."""
     frames = len(normalized.points)
     gram, total = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2))
     sample = np.zeros((frames, len(chosen), 2))
@@ -339,7 +339,7 @@ def _carry(
 
 
 def _interpolated(points: Floats, weight: Floats) -> Floats:
-    """Return the starting points: hidden entries interpolated in time, distant ones clipped."""
+    """Return starting values: hidden entries interpolated in time, distant ones clipped."""
     filled = points.copy()
     frames = np.arange(len(points))
     for index in np.flatnonzero((weight == 0).any(axis=0)):
@@ -350,7 +350,7 @@ def _interpolated(points: Floats, weight: Floats) -> Floats:
 
 
 def _widen(basis: Floats, points: Floats, weight: Floats, start: Floats, rank: int) -> Floats:
-    """Return a basis of `rank` columns: the given ones, then the leading directions of their residual."""
+    """Return a basis of `rank` columns: the given ones and the leading directions of their residual."""
     frames = len(points)
     if basis.shape[2] == 0:
         left, shift = start, start.mean(axis=1)
@@ -368,7 +368,7 @@ def _widen(basis: Floats, points: Floats, weight: Floats, start: Floats, rank: i
 
 
 def _orthonormal(basis: Floats) -> tuple[Floats, Floats]:
-    """Return the basis with orthonormal columns, and the matrix that maps old coefficients to new ones."""
+    """Return the basis with orthonormal columns (except the translation), and the matrix from old to new coefficients."""
     columns = basis[:, :, :-1]
     frames, _, rank = columns.shape
     unit, change = np.linalg.qr(columns.reshape(2 * frames, rank))

@@ -1,13 +1,13 @@
-"""Whether frames come in the order of a film, and an order of their own for photographs.
+"""Test of whether frames come in the order of a film, and an order by content for unordered photographs.
 
-If a point's image walks from frame to frame, its step has variance s² given the frame before; if frames are independent, its image has
-variance v about the mean, and two frames differ by 2v. The walk is the more probable of the two where s² < v: where the squared
-difference of neighbouring frames is less than half of that of any two frames. The difference of two frames is the mean over the points or
-their median, whichever shows a walk: gross outliers, which differ as much between neighbours as between any frames, decide a mean, and
-points that stand still a median.
+In a film, the image of a point is a random walk: its step from the previous frame has variance s². In independent frames it has variance v
+about its mean, and two frames differ by 2v. The walk is more probable if s² < v, that is, if the squared difference of neighbouring frames
+is less than half that of any two frames. The difference of two frames is the mean or the median over the points, whichever gives the
+smaller ratio: gross outliers, which differ as much between neighbours as between any frames, dominate the mean, and static points the
+median.
 
-Photographs in no order are put in an order that follows from their content, so that nothing depends on the order that they came in: each
-frame is followed by the most similar one that is left.
+Unordered photographs are sorted by content, so that the result does not depend on the given order: each frame is followed by the most
+similar remaining one.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from pliant.solver.tracks.frame_selection import evenly_spread
 from pliant.solver.tracks.noise import weighted_median
 
 WALK_SHARE = 0.5
-"""Squared difference of neighbouring frames over that of any two below which the walk is more probable; see above. Recorded films, with up
-to 20 % gross outliers, have at most .40, photographs and shuffled films at least .74."""
+"""Ratio of the squared difference of neighbouring frames to that of any two frames below which the walk is more probable. Recorded films
+with up to 20 % gross outliers have at most .40, photographs and shuffled films at least .74."""
 
 MAX_PAIRS, MAX_POINTS = 200, 2000
-"""Maximum numbers of pairs of frames and of points that are compared; they bound time and memory."""
+"""Maximum numbers of frame pairs and of points compared; they bound time and memory."""
 
 MAX_UNORDERED_FRAMES = 360
-"""Maximum number of photographs: all of them are learned from, since between photographs nothing can be interpolated
+"""Maximum number of photographs. Cameras and prior are learned from all of them, because photographs cannot be interpolated
 (`limits.LEARNED_FRAMES`)."""
 
 
 def resolved_order(tracks: Tracks, settings: Settings) -> tuple[Settings, str]:
-    """Return the settings with `order` `film` or `any`, and a sentence.
+    """Return the settings with `order` resolved to `film` or `any`, and the reason as a sentence.
 
     Raises
     ------
@@ -60,16 +60,16 @@ def resolved_order(tracks: Tracks, settings: Settings) -> tuple[Settings, str]:
         return replace(settings, order="film"), f"Frames in the order of a film: {found}."
     if not settings.gaussian or tracks.num_frames > MAX_UNORDERED_FRAMES:
         why = (
-            "other priors than gaussian need it" if not settings.gaussian else "there are too many frames for no order"
+            "other priors than gaussian need it" if not settings.gaussian else "there are too many frames for order any"
         )
         return replace(settings, order="film"), f"Frames in the order of a film, since {why}: {found}."
     return replace(settings, order="any"), f"Frames in no order: {found}."
 
 
 def differences(tracks: Tracks) -> Floats:
-    """Return the mean squared difference of the images of every two frames, each about its centroid, shape `(F, F)`.
+    """Return the mean squared difference between the points of every two frames, relative to their centroids, shape `(F, F)`.
 
-    Points count by the product of their confidences; infinite where two frames have no point in common.
+    Points are weighted by the product of their confidences; the value is infinite if two frames have no point in common.
     """
     weight = tracks.visible
     total = np.maximum(weight.sum(axis=1), np.finfo(float).tiny)
@@ -85,10 +85,10 @@ def differences(tracks: Tracks) -> Floats:
 
 
 def step_share(tracks: Tracks) -> float:
-    """Return the squared difference of neighbouring frames over that of any two; NaN where nothing moves or can be compared.
+    """Return the ratio of the squared difference of neighbouring frames to that of any two; NaN if nothing moves or is comparable.
 
-    Differences are averaged over pairs of frames. Of two frames it is the mean or the median over their common points, weighted by the
-    products of their confidences; the smaller of the two results is returned.
+    Differences are averaged over pairs of frames. The difference of two frames is the mean or the median over their common points, weighted
+    by the products of the confidences; the smaller of the two ratios is returned.
     """
     every = -(-tracks.num_points // MAX_POINTS)
     points, weight = tracks.points[:, ::every], tracks.visible[:, ::every]
@@ -101,9 +101,9 @@ def step_share(tracks: Tracks) -> float:
 
 
 def _typical(points: Floats, weight: Floats, pairs: Iterable[tuple[int, int]]) -> tuple[float, float]:
-    """Return mean and median over points of the squared difference, averaged over the pairs with points in common; NaN if none has.
+    """Return mean and median over points of the squared difference, averaged over the pairs with common points; NaN if there are none.
 
-    The median motion of the points between two frames does not count.
+    The median motion of the points between the two frames is subtracted first.
     """
     found = []
     for first, second in pairs:
@@ -118,7 +118,7 @@ def _typical(points: Floats, weight: Floats, pairs: Iterable[tuple[int, int]]) -
 
 
 def content_order(between: Floats) -> NDArray[np.intp]:
-    """Return the frames in an order of their own: first the one that differs most from the others, then always the most similar one."""
+    """Return an order by content: first the frame that differs most from the others, then always the most similar remaining one."""
     finite = np.where(np.isfinite(between), between, 2 * np.max(between, where=np.isfinite(between), initial=1.0))
     order = [int(finite.sum(axis=1).argmax())]
     left = np.ones(len(finite), dtype=bool)
@@ -130,7 +130,7 @@ def content_order(between: Floats) -> NDArray[np.intp]:
 
 
 def in_order(tracks: Tracks, cameras: KnownCamera | None, order: NDArray[np.intp]) -> tuple[Tracks, KnownCamera | None]:
-    """Return tracks and cameras with their frames in another order."""
+    """Return tracks and cameras with their frames in the given order."""
     moved = Tracks.from_arrays(tracks.points[order], tracks.visible[order])
     if cameras is None:
         return moved, None
@@ -139,7 +139,7 @@ def in_order(tracks: Tracks, cameras: KnownCamera | None, order: NDArray[np.intp
 
 
 def as_they_came(solution: Solution, order: NDArray[np.intp]) -> Solution:
-    """Return the solution of frames that were put in this order with its frames as they came; the world axes stay."""
+    """Return the solution with its frames back in the original order; `order` is the one they were solved in."""
     back = np.argsort(order)
 
     def moved(values: Floats) -> Floats:

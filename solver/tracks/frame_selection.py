@@ -1,4 +1,4 @@
-"""Selection of the frames that something is learned from, and interpolation between them."""
+"""Selection of frames, and interpolation between them."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from scipy.spatial.transform import Rotation, Slerp
 
 
 def informative_frames(visible: Floats) -> NDArray[np.bool_]:
-    """Return which frames show at least a tenth of the median number of points, shape `(F,)`; all if fewer than three do."""
+    """Return a mask of the frames with at least 3 points and a tenth of the median number, shape `(F,)`; all if fewer than 3 qualify."""
     seen = (visible > 0).sum(axis=1)
     is_identifiable = np.asarray(seen >= max(3.0, 0.1 * float(np.median(seen[seen > 0]))))
     return is_identifiable if is_identifiable.sum() >= 3 else np.ones(len(seen), dtype=bool)
 
 
 def evenly_spread(total: int, count: int) -> NDArray[np.intp]:
-    """Return at most `count` of the numbers below `total`, evenly spread from the first to the last."""
+    """Return at most `count` indices below `total`, evenly spread from the first to the last."""
     return np.unique(np.linspace(0, total - 1, min(total, count)).round().astype(np.intp))
 
 
 def of_frames(gram: Floats, used: NDArray[np.intp]) -> Floats:
-    """Return the Gram matrix of some frames, shape `(2F', 2F')`."""
+    """Return the rows and columns of a Gram matrix that belong to the frames `used`, shape `(2F', 2F')`."""
     rows = np.stack([2 * used, 2 * used + 1], axis=1).ravel()
     return gram[np.ix_(rows, rows)]
 
 
 def between(used: NDArray[np.intp], values: Floats, frames: int) -> Floats:
-    """Return values of all frames, interpolated between those of the frames used, shape `(F, n)`."""
+    """Return values of all frames, linearly interpolated between the `values (F', n)` of the frames `used`, shape `(F, n)`."""
     return np.stack([np.interp(np.arange(frames), used, each) for each in values.T], axis=1)
 
 
 def rotations_between(used: NDArray[np.intp], rotations: Floats, frames: int) -> Floats:
-    """Return rotations of all frames, on the shortest path between those of the frames used, shape `(F, 3, 3)`."""
+    """Return rotations of all frames, interpolated between the frames `used` on the shortest path, shape `(F, 3, 3)`."""
     path = Slerp(used, Rotation.from_matrix(rotations))
     found: Floats = path(np.clip(np.arange(frames), used[0], used[-1])).as_matrix()
     found[used] = rotations

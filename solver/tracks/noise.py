@@ -9,21 +9,21 @@ from numpy.typing import NDArray
 from pliant.solver.records import Floats
 
 MIN_EIGENVALUE_RATIO = 1e-9
-"""Minimum ratio of the median to the largest eigenvalue of the Gram matrix; below it P < 2F and the matrix is singular."""
+"""Minimum ratio of the median to the largest eigenvalue of the Gram matrix; below it the matrix counts as rank-deficient."""
 
 OUTLIER_SHARE = 0.005
 """Share of gross outliers in the completion of the tracks above which outliers are rejected."""
 
 
 def magnified(order: int) -> float:
-    """Return the factor by which differences of this order over frames amplify the standard deviation of white noise."""
+    """Return the factor by which differences of an order over frames amplify the standard deviation of white noise."""
     return float(np.sqrt(comb(2 * order, order)))
 
 
 def roughness(gram: Floats) -> float:
-    """Return the variance of white noise with the same median, over frames, of the mean squared third difference.
+    """Return the variance of white noise with the same median over frames of the mean squared third difference.
 
-    This is an upper estimate, because jerky motion counts as noise. Short sequences use lower differences.
+    This overestimates the noise, because jerky motion counts as noise. Short sequences use differences of lower order.
     """
     frames = len(gram) // 2
     order = min(3, frames - 1)
@@ -37,7 +37,7 @@ def roughness(gram: Floats) -> float:
 def typical_roughness(points: Floats) -> float:
     """Return the standard deviation of white noise with the same median third difference as complete tracks `(F, P, 2)`.
 
-    Unlike `roughness`, it is robust to a few wrong points.
+    Unlike `roughness`, it is robust to a few outliers.
     """
     order = min(3, len(points) - 1)
     size = np.abs(np.diff(points, n=order, axis=0))
@@ -47,7 +47,7 @@ def typical_roughness(points: Floats) -> float:
 def white_noise(gram: Floats) -> float:
     """Return σ², the median eigenvalue of W Wᵀ / P `(2F, 2F)`: low-rank motion leaves it at 0, noise raises it.
 
-    With too few points the median is 0 whatever the noise; the roughness is returned instead.
+    With too few points the median is 0 regardless of the noise, so `roughness` is returned instead.
     """
     values = np.linalg.eigvalsh(gram)
     median = float(values[len(values) // 2])
@@ -55,7 +55,7 @@ def white_noise(gram: Floats) -> float:
 
 
 def weighted_median(values: NDArray[np.floating], weights: NDArray[np.floating]) -> float:
-    """Return the least value with at least half of the weight at or below it; the usual median for equal weights."""
+    """Return the smallest value with at least half of the weight at or below it; the usual median for equal weights."""
     if (weights == weights[0]).all():
         return float(np.median(values))
     order = np.argsort(values, kind="stable")

@@ -12,7 +12,7 @@ from pliant.solver.records import Floats, Tracks, read_only
 from pliant.solver.tracks.frame_selection import between
 
 MAX_MEDIAN_RADII = 10.0
-"""Distance from the frame's median, in median radii, beyond which an observation is ignored for centre and size."""
+"""Distance from the frame's median, in median radii, beyond which an observation does not count for centroid and unit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,7 +23,7 @@ class Normalized:
     """Shape `(F, P, 2)`, RMS radius 1; 0 where hidden."""
 
     visible: Floats
-    """Confidence relative to the largest of the tracks, shape `(F, P)`: only their ratios count. 0 where hidden."""
+    """Confidence relative to the maximum, shape `(F, P)`, because only ratios count; 0 where hidden."""
 
     centroid: Floats
     """Mean of each frame's visible points, shape `(F, 2)`, the tracks' unit; interpolated in frames without any."""
@@ -32,14 +32,14 @@ class Normalized:
     """One normalized unit: RMS radius of the centred tracks, the tracks' unit."""
 
     full_confidence: float
-    """Confidence of the tracks that counts as 1: their largest."""
+    """Confidence that counts as 1: the maximum over the tracks."""
 
 
 def normalize(tracks: Tracks) -> Normalized:
     """Remove the centroid of each frame and divide by the RMS radius of the centred points.
 
     Both are confidence-weighted means. Observations further than `MAX_MEDIAN_RADII` median radii from their frame's
-    median are excluded from the means, because a single one can make the object arbitrarily small; they stay in the
+    median are excluded from the means, because a single one can make the object arbitrarily small. They stay in the
     tracks, where the robust loss handles them.
 
     Raises
@@ -74,7 +74,7 @@ def normalize(tracks: Tracks) -> Normalized:
 
 
 def relative(confidence: Floats, full: float) -> Floats:
-    """Return confidences, shape `(F, P)`, as shares of `full`, read-only; themselves where that is 1, or nothing is seen."""
+    """Return `confidence (F, P)` divided by `full`, read-only; unchanged if `full` is 0 or 1."""
     if full in (0, 1):
         return confidence
     shares = confidence / full
@@ -83,7 +83,7 @@ def relative(confidence: Floats, full: float) -> Floats:
 
 
 def _near(tracks: Tracks, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which visible observations lie within `MAX_MEDIAN_RADII` median radii of their frame's median, shape `(F, P)`."""
+    """Return a mask of the visible observations within `MAX_MEDIAN_RADII` median radii of their frame's median, shape `(F, P)`."""
     near = seen.copy()
     radius = np.zeros(seen.shape)
     for frame, mask in enumerate(seen):
@@ -97,7 +97,7 @@ def _near(tracks: Tracks, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _median(values: Floats) -> float:
-    """Return the median of finite `values (N,)`, which are reordered; `np.median` takes three times as long for 40 million."""
+    """Return the median of finite `values (N,)`, reordering them; for 40 million, `np.median` takes three times as long."""
     lower, upper = (values.size - 1) // 2, values.size // 2
     values.partition((lower, upper))
     return float((values[lower] + values[upper]) / 2)

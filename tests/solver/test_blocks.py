@@ -1,4 +1,4 @@
-"""Shapes that are solved in blocks of points."""
+"""Shapes solved in blocks of points."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def whole(film: gallery.Sequence, settings: Settings) -> Solution:
 
 
 @pytest.mark.usefixtures("limited")
-def test_blocks_give_the_shapes_of_a_solve_at_once(film: gallery.Sequence, settings: Settings, whole: Solution) -> None:
+def test_solving_in_blocks_matches_solving_at_once(film: gallery.Sequence, settings: Settings, whole: Solution) -> None:
     steps: list[Step] = []
     solution = solve(film.tracks, film.mesh, cameras=given(film), settings=settings, on_step=steps.append)
     size = np.sqrt(np.square(whole.shapes).sum(axis=2).mean())
@@ -84,7 +84,7 @@ def test_blocks_give_the_shapes_of_a_solve_at_once(film: gallery.Sequence, setti
 
 
 @pytest.mark.usefixtures("limited")
-def test_a_stop_between_blocks_leaves_a_result(film: gallery.Sequence) -> None:
+def test_a_stop_between_blocks_returns_finite_shapes(film: gallery.Sequence) -> None:
     asked = 0
 
     def later() -> bool:
@@ -100,7 +100,7 @@ def test_a_stop_between_blocks_leaves_a_result(film: gallery.Sequence) -> None:
 
 @pytest.mark.usefixtures("limited")
 @pytest.mark.slow
-def test_the_verdict_is_that_of_all_points_and_choices_those_of_all_blocks(film: gallery.Sequence) -> None:
+def test_verdict_and_outlier_share_in_blocks_match_solving_at_once(film: gallery.Sequence) -> None:
     tracks, _ = gallery.corrupt_tracks(film.tracks, noise=0.003, outliers=0.08, hidden=0.3, seed=0)
     cameras, settings = given(film), Settings(max_reweightings=3)
     parts = solve(tracks, film.mesh, cameras=cameras, settings=settings)
@@ -109,14 +109,14 @@ def test_the_verdict_is_that_of_all_points_and_choices_those_of_all_blocks(film:
     assert parts.trust is not None
     assert whole.trust is not None
     assert parts.trust.hidden == pytest.approx(whole.trust.hidden, abs=2e-3)
-    assert parts.trust.hidden > 0.33  # rejected observations among them
+    assert parts.trust.hidden > 0.33  # includes rejected observations
     assert [reason[:20] for reason in parts.trust.reasons] == [reason[:20] for reason in whole.trust.reasons]
     rejected = [float(each.choices.reasons["outliers"].split("%")[0]) for each in (parts, whole)]
     assert rejected[0] == pytest.approx(rejected[1], abs=0.3)
 
 
 @pytest.mark.usefixtures("limited")
-def test_what_every_block_chooses_is_reported_as_medians_and_every_warning(film: gallery.Sequence) -> None:
+def test_choices_of_blocks_are_reported_as_medians_with_all_warnings(film: gallery.Sequence) -> None:
     solution = solve(film.tracks, film.mesh, cameras=given(film), settings=Settings(prior="smooth", max_reweightings=2))
     whole = blocks._Whole(film.tracks, estimate_cameras(film.tracks, given(film)), None, None)
     kept = np.arange(POINTS)
@@ -141,7 +141,7 @@ def test_blocks_are_equal_parts_of_all_points(film: gallery.Sequence) -> None:
     assert sorted(len(part) for part in blocks.blocks(film.tracks, 7)) == pytest.approx(np.full(7, POINTS / 7), abs=1)
 
 
-def test_a_margin_has_as_many_rings_as_asked(monkeypatch: pytest.MonkeyPatch, film: gallery.Sequence) -> None:
+def test_a_margin_of_one_adds_one_ring_of_neighbours(monkeypatch: pytest.MonkeyPatch, film: gallery.Sequence) -> None:
     own = np.array([450])
     monkeypatch.setattr(blocks, "MARGIN", 1)
     near = blocks.with_margin(own, film.mesh.edges, POINTS)
@@ -151,7 +151,7 @@ def test_a_margin_has_as_many_rings_as_asked(monkeypatch: pytest.MonkeyPatch, fi
     assert mesh_of(film.mesh, near).num_points == len(near)
 
 
-def test_only_priors_of_single_points_are_solved_in_blocks() -> None:
+def test_small_sequences_need_no_blocks() -> None:
     tracks = Tracks.from_arrays(np.zeros((3, 4, 2)))
     assert not blocks.needs_blocks(tracks, Settings())
     big = gallery.face(3, 50).tracks
@@ -159,7 +159,7 @@ def test_only_priors_of_single_points_are_solved_in_blocks() -> None:
 
 
 @pytest.mark.usefixtures("limited")
-def test_a_result_in_a_file_is_that_in_memory(film: gallery.Sequence, tmp_path: Path) -> None:
+def test_results_in_scratch_files_equal_those_in_memory(film: gallery.Sequence, tmp_path: Path) -> None:
     settings = Settings(max_reweightings=2)
     np.save(tmp_path / "tracks.npy", film.tracks.points)
     folder = tmp_path / "scratch"
@@ -177,7 +177,7 @@ def test_a_result_in_a_file_is_that_in_memory(film: gallery.Sequence, tmp_path: 
 
 @pytest.mark.usefixtures("limited")
 @pytest.mark.slow
-def test_the_stages_are_the_whole_solve_in_blocks_too(film: gallery.Sequence, tmp_path: Path) -> None:
+def test_composed_stages_equal_solve_in_blocks_too(film: gallery.Sequence, tmp_path: Path) -> None:
     settings = Settings(max_reweightings=4)
     whole = solve(film.tracks, film.mesh, cameras=given(film), settings=settings)
     cameras = estimate_cameras(film.tracks, given(film), settings=settings)
@@ -226,8 +226,8 @@ def bytes_per_observation(block: int) -> float:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux resets the peak of a process")
-def test_memory_of_an_observation_solved_at_once_and_in_blocks() -> None:
-    """Besides the tracks, 24 bytes: 310 at once; in many small blocks what is held of all points, 56, and a block."""
+def test_memory_per_observation_is_bounded_at_once_and_in_blocks() -> None:
+    """Besides the tracks (24 bytes): 310 bytes at once; in many small blocks, 56 held for all points plus one block."""
     at_once, in_blocks = bytes_per_observation(10_000_000), bytes_per_observation(60_000)
 
     assert at_once < 360

@@ -1,6 +1,6 @@
-"""Figure 1 of Dai, Deng, He (2017) in kind: what each step of the method is worth on a face with gross outliers.
+"""Figure 1 of Dai, Deng, He (2017), qualitatively: the gain of each step of the method on a face with gross outliers.
 
-There, e3d of a sequence with outliers: pseudo-inverse .5084, temporal .1835, with space .0757, with L1 .0700.
+Published e3d of a sequence with outliers: pseudo-inverse .5084, temporal .1835, with space .0757, with L1 .0700.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def test_every_step_helps_against_outliers(outliers: float, estimated: bool) -> 
     assert 0.01 < robust < 0.1
 
 
-def test_without_outliers_least_squares_keep_the_published_weight() -> None:
+def test_clean_tracks_keep_the_published_temporal_weight() -> None:
     flat, temporal, spatial, robust = errors(FACE, estimated=False)
     assert 0.1 < flat < 0.4
     assert flat > 3 * temporal

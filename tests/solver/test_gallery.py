@@ -16,7 +16,7 @@ NAMES = ["face", "face-triangles", "flag", "flag-triangles", "sphere", "talk"]
 
 
 def residual(sequence):
-    """What is left after the true camera explains the tracks: one translation per frame."""
+    """Tracks minus projected true shapes, NaN if hidden; only one translation per frame remains."""
     projected = sequence.scales[:, None, None] * (sequence.shapes @ sequence.rotations[:, :2].transpose(0, 2, 1))
     return np.where(sequence.tracks.visible[..., None] > 0, sequence.tracks.points - projected, np.nan)
 
@@ -33,7 +33,7 @@ def test_truth_explains_the_tracks_exactly(made):
 @pytest.mark.parametrize("make", [face, flag])
 @pytest.mark.parametrize("mesh", ["grid", "triangles"])
 @pytest.mark.parametrize("count", [4, 5, 17, 100, 997])
-def test_any_number_of_points_is_exact(make, mesh, count):
+def test_faces_and_flags_have_exactly_the_requested_points(make, mesh, count):
     made = make(3, count, mesh=mesh)
     assert made.shapes.shape == (3, count, 3)
     assert (made.mesh.grid is not None) == (mesh == "grid")
@@ -68,7 +68,7 @@ def test_a_flag_does_not_stretch_along_its_threads_but_bends():
     assert np.ptp(made.shapes[..., 2]) > 60
 
 
-def test_a_face_moves_where_faces_move():
+def test_a_face_moves_at_the_mouth_and_not_at_the_nose_bridge():
     made = face(40, 2000)
     motion = made.shapes.std(axis=0).sum(axis=1)
     x, y = made.shapes[:, :, 0].mean(axis=0), made.shapes[:, :, 1].mean(axis=0)
@@ -84,7 +84,7 @@ def test_a_face_moves_where_faces_move():
     assert values[19] < 0.01 * values[0]
 
 
-def test_the_sphere_breathes_and_hides_its_far_side():
+def test_the_sphere_radius_varies_and_its_far_side_is_hidden():
     ball = sphere(40, 500)
     radius = np.linalg.norm(ball.shapes, axis=2)
     assert np.ptp(radius.mean(axis=1)) > 0.15 * radius.mean()
@@ -119,7 +119,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not(make):
         first.shapes[0] = 0
 
 
-def test_noise_has_the_size_of_the_protocol():
+def test_noise_std_is_relative_to_the_largest_coordinate():
     clean = face(20, 500)
     noisy = corrupt(clean, noise=0.03, seed=1)
     points = clean.tracks.points

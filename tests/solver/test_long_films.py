@@ -1,4 +1,4 @@
-"""Films of more frames than are learned from together."""
+"""Films with more frames than are learned from jointly."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def given(sequence: gallery.Sequence) -> KnownCamera:
 
 @pytest.mark.usefixtures("limited")
 @pytest.mark.slow
-def test_deformation_between_the_frames_learned_from_is_found(film: gallery.Sequence) -> None:
+def test_deformation_between_the_learned_frames_is_recovered(film: gallery.Sequence) -> None:
     found = estimate_cameras(film.tracks, given(film))
     prior = learn_prior(film.tracks, found)
     used = np.arange(0, FRAMES, 6)
@@ -61,7 +61,7 @@ def test_deformation_between_the_frames_learned_from_is_found(film: gallery.Sequ
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("limited")
-def test_a_quick_motion_that_interpolation_loses_is_found(
+def test_resection_recovers_fast_motion_that_interpolation_loses(
     film: gallery.Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     solution = solve(film.tracks, film.mesh)
@@ -76,7 +76,7 @@ def test_a_quick_motion_that_interpolation_loses_is_found(
 
 
 @pytest.mark.usefixtures("limited")
-def test_hidden_points_and_outliers_of_the_other_frames_are_predicted(film: gallery.Sequence) -> None:
+def test_hidden_points_and_outliers_are_predicted_in_every_frame(film: gallery.Sequence) -> None:
     spoiled, _ = gallery.corrupt_tracks(film.tracks, outliers=0.03, noise=0.0)
     visible = np.random.default_rng(0).random((FRAMES, 60)) > 0.2
     tracks = Tracks.from_arrays(spoiled.points, visible)
@@ -103,7 +103,7 @@ def test_perspective_is_corrected_in_every_frame(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.usefixtures("limited")
-def test_a_stop_leaves_cameras_for_every_frame(film: gallery.Sequence) -> None:
+def test_a_stop_returns_finite_shapes_for_every_frame(film: gallery.Sequence) -> None:
     solution = solve(film.tracks, film.mesh, should_stop=lambda: True)
     assert solution.outcome is Outcome.STOPPED
     assert solution.shapes.shape == (FRAMES, 60, 3)
@@ -111,7 +111,7 @@ def test_a_stop_leaves_cameras_for_every_frame(film: gallery.Sequence) -> None:
 
 
 @pytest.mark.usefixtures("limited")
-def test_scales_that_are_not_given_are_found_in_every_frame(film: gallery.Sequence) -> None:
+def test_unknown_scales_are_estimated_in_every_frame(film: gallery.Sequence) -> None:
     zoom = np.exp(0.2 * np.sin(np.arange(FRAMES) / 3))
     points = film.tracks.points * zoom[:, None, None]
     settings = Settings(camera="scaled_orthographic")
@@ -120,7 +120,7 @@ def test_scales_that_are_not_given_are_found_in_every_frame(film: gallery.Sequen
     assert np.std(ratio) < 0.03  # without resection 0.14
 
 
-def test_depths_by_factors_are_those_of_the_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_factored_depth_map_matches_the_dense_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(0)
     rotations, scales = exponential(0.3 * random.normal(size=(20, 3))), np.exp(0.1 * random.normal(size=20))
     covariance = ShapeCovariance(np.eye(3), np.diag([1.5, 1.0, 0.5]), random.normal(size=(20, 2)), 0.01, 1e-4, 0.0)

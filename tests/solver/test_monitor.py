@@ -76,12 +76,13 @@ def test_a_stop_in_every_stage_is_reported(noisy: bool) -> None:
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_a_stop_at_every_unit_of_the_smooth_prior_is_reported() -> None:
+def test_a_stop_at_every_eleventh_query_of_the_smooth_prior_is_reported() -> None:
     tracks, settings = small(), Settings(prior="smooth")
     for number in range(1, questions(tracks, settings) + 1, 11):
         stopped_at(tracks, settings, number)
 
 
+@pytest.mark.slow
 def test_progress_moves_evenly_and_never_falls() -> None:
     steps: list[Step] = []
     solve(small(), on_step=steps.append)
@@ -103,7 +104,7 @@ def test_units_fill_a_stage_and_never_overflow_it() -> None:
     assert fractions[-1] < 0.5
 
 
-def test_stages_that_do_not_run_leave_the_plan_and_others_join_it() -> None:
+def test_skipped_stages_leave_the_plan_and_new_ones_join_it() -> None:
     steps: list[Step] = []
     plan = [Stage("multistart", 2.0, 10), Stage("scales", 100.0, 10), Stage("shapes", 2.0, 10), Stage("trust", 1.0, 10)]
     monitor = Monitor(steps.append, plan=plan)
@@ -112,7 +113,7 @@ def test_stages_that_do_not_run_leave_the_plan_and_others_join_it() -> None:
     monitor.report(Step("cameras", 0.0))
     assert steps[-1].fraction == pytest.approx(0.45 * 2 / 105)
     monitor.enter("nothing of that name")
-    monitor.enter("shapes")  # scales are left out
+    monitor.enter("shapes")  # scales are skipped
     monitor.report(Step("initialise", 0.0, objective=1.0))
     for objective in (0.5, 0.25, 0.125):  # half of the usual six
         monitor.report(Step("reweight", 0.0, objective=objective))
@@ -121,7 +122,7 @@ def test_stages_that_do_not_run_leave_the_plan_and_others_join_it() -> None:
     monitor.enter("scales", units=20)  # twice as long as planned
     monitor()
     monitor.report(Step("cameras", 0.0))
-    assert steps[-1].fraction == pytest.approx(1.9 / 3.9)  # a plan that grows does not go back
+    assert steps[-1].fraction == pytest.approx(1.9 / 3.9)  # progress does not decrease when the plan grows
     monitor.enter("trust")
     assert monitor() is False
     assert steps[-1].fraction == pytest.approx((1.9 + 0.45 + 0.09) / (1.9 + 0.45 + 1))
@@ -153,7 +154,7 @@ def test_pulses_are_reported_after_a_silence_and_count_no_work() -> None:
     assert {step.fraction for step in steps} == {0.0}
 
 
-def test_every_range_of_work_of_the_calling_thread_pulses() -> None:
+def test_ranges_pulse_only_on_the_calling_thread() -> None:
     callers: list[int] = []
     with pulses_to(lambda: callers.append(threading.get_ident())):
         over_ranges(lambda _start, _stop: pulse(), 4)
@@ -163,9 +164,7 @@ def test_every_range_of_work_of_the_calling_thread_pulses() -> None:
 
 
 @pytest.mark.parametrize("blocks", [False, True])
-def test_linear_algebra_reports_between_its_pieces_and_returns_the_same(
-    blocks: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_frequent_reports_do_not_change_the_shapes(blocks: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     sequence = gallery.face(7, 60, degrees=60)
     settings = Settings(prior="smooth", refine_rotations=False, max_reweightings=5)
     if blocks:
@@ -189,7 +188,7 @@ def descended(objectives: list[float], *, unseen: float = 0.0, iterations: int =
     return descent
 
 
-def test_reweightings_that_are_left_follow_the_decrease_of_the_objective() -> None:
+def test_remaining_reweightings_are_predicted_from_the_objective() -> None:
     objectives = list(1 + 0.5 ** np.arange(25))
     ends = next(n for n in range(1, 25) if (objectives[n - 1] - objectives[n]) / objectives[n - 1] <= 1e-4)
     for count in range(8, ends):
@@ -204,7 +203,7 @@ def test_reweightings_that_are_left_follow_the_decrease_of_the_objective() -> No
     assert 34 < steps_left(power[49], power[48], 50, tolerance=1e-4) < 51, "between geometric, 34, and a power, 50"
 
 
-def test_points_hidden_for_long_make_more_and_longer_reweightings() -> None:
+def test_long_hidden_gaps_predict_more_and_longer_reweightings() -> None:
     visible = np.ones((20, 2))
     visible[3:6, 0] = visible[10:12, 0] = 0
     visible[:, 1] = [1, 0] * 10
@@ -226,7 +225,7 @@ def test_points_hidden_for_long_make_more_and_longer_reweightings() -> None:
     assert seconds[1] > 4 * seconds[0]
 
 
-def test_where_nothing_is_hidden_the_end_comes_early_and_costs_little() -> None:
+def test_complete_tracks_predict_few_and_short_reweightings() -> None:
     """Objectives and units of a flag of 40 frames: iterations fall from 34 to 3 in the last reweighting."""
     objectives, units = [382.36, 14.423, 2.2499, 1.9998, 1.99246, 1.99241], [12, 10, 12, 39, 8]
     descent = Descent(0.0, tolerance=1e-4)
@@ -243,7 +242,7 @@ def test_where_nothing_is_hidden_the_end_comes_early_and_costs_little() -> None:
     assert hidden.reweightings_left() > descended(objectives[:5]).reweightings_left() + 1, "hidden points settle slowly"
 
 
-def test_a_stage_that_ends_early_is_no_sign_of_a_fast_machine() -> None:
+def test_a_stage_that_ends_early_does_not_change_the_pace() -> None:
     pace = Pace(0.0)
     pace.next(Stage("refinement", 10.0, 1000), 0.1, 1.0)  # a tenth of the units in a tenth of the time
     assert pace.known == 1.0
@@ -271,7 +270,7 @@ def test_corrections_for_perspective_are_expected_and_counted_down() -> None:
     assert left[-1] == 0
 
 
-def test_units_that_take_ever_longer_and_preparation_count_by_their_time() -> None:
+def test_progress_accounts_for_growing_unit_times_and_setup() -> None:
     def filled(stage: Stage, units: int) -> float:
         steps: list[Step] = []
         monitor = Monitor(steps.append, plan=[stage])
@@ -314,7 +313,7 @@ def timed(plan: list[Stage]) -> tuple[Monitor, list[Step], list[float]]:
     return Monitor(steps.append, plan=plan, clock=lambda: now[0], work=lambda: now[0]), steps, now
 
 
-def test_a_slow_machine_multiplies_the_planned_time_that_is_left() -> None:
+def test_remaining_time_scales_with_the_measured_pace() -> None:
     monitor, steps, now = timed([Stage("multistart", 10.0, 10), Stage("scales", 5.0, 10), Stage("trust", 5.0, 10)])
     for unit in range(10):
         now[0] = 3.0 * (unit + 1)
@@ -329,13 +328,13 @@ def test_a_slow_machine_multiplies_the_planned_time_that_is_left() -> None:
     assert steps[-1].seconds_left == 0.0
 
 
-def test_the_latest_load_of_the_machine_converts_work_into_time() -> None:
+def test_remaining_time_follows_the_latest_machine_load() -> None:
     steps: list[Step] = []
     now, work = [0.0], [0.0]
     plan = [Stage("multistart", 100.0, 100)]
     monitor = Monitor(steps.append, plan=plan, clock=lambda: now[0], work=lambda: work[0])
     left = []
-    for slow in [1] * 10 + [4] * 10:  # others come to use the cores
+    for slow in [1] * 10 + [4] * 10:  # other processes take the cores
         work[0] += 5.0
         now[0] += 5.0 * slow
         monitor()
@@ -345,7 +344,7 @@ def test_the_latest_load_of_the_machine_converts_work_into_time() -> None:
     assert left[19] == pytest.approx(4 * 5 * 80, rel=0.2)
 
 
-def test_shapes_slower_than_planned_are_extrapolated_by_themselves() -> None:
+def test_a_slow_shapes_stage_is_extrapolated_separately() -> None:
     monitor, steps, now = timed([Stage("multistart", 10.0, 10), Stage("shapes", 1.0, 100), Stage("trust", 1.0, 10)])
     for unit in range(10):
         now[0] = unit + 1.0
@@ -371,14 +370,14 @@ def test_shapes_slower_than_planned_are_extrapolated_by_themselves() -> None:
 
 
 def places(tracks: Tracks, settings: Settings, cameras: KnownCamera | None = None) -> dict[str, int]:
-    """The number of the first question that each place in the source asks, while nothing stops."""
+    """The index of the first stop query from each source location, in a solve that is not stopped."""
     first: dict[str, int] = {}
     asked = 0
 
     def never() -> bool:
         nonlocal asked
         asked += 1
-        caller = sys._getframe(2)  # the place that calls the monitor, which calls this
+        caller = sys._getframe(2)  # the caller of the monitor, which calls this
         first.setdefault(f"{Path(caller.f_code.co_filename).name}:{caller.f_lineno}", asked)
         return False
 
@@ -396,19 +395,19 @@ CASES = {
 @pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.parametrize("case", CASES)
-def test_a_stop_at_every_place_that_asks_is_reported(case: str) -> None:
+def test_a_stop_at_every_call_site_is_reported(case: str) -> None:
     tracks, settings = CASES[case]
     cameras = KnownCamera.from_arrays(np.tile(np.eye(3), (tracks.num_frames, 1, 1)))
     asking, later = places(tracks, settings), places(tracks, settings, cameras)
     assert len(asking) > 5, "the monitor is asked in many places"
-    for number in later.values():  # known cameras lead there sooner
+    for number in later.values():  # known cameras reach these sooner
         stopped_at(tracks, settings, number, cameras)
     for place in asking.keys() - later.keys():
         stopped_at(tracks, settings, asking[place])
 
 
 @pytest.mark.slow
-def test_a_stop_at_every_third_question_of_a_small_solve_is_reported() -> None:
+def test_a_stop_at_every_third_query_of_a_small_solve_is_reported() -> None:
     tracks, settings = (
         gallery.face(3, 6, degrees=60).tracks,
         Settings(prior="smooth", refine_rotations=False, max_reweightings=3),
@@ -426,7 +425,7 @@ def test_the_plan_counts_the_gram_matrix_of_many_points() -> None:
     assert 5 < many.seconds < 20  # 100 × 1,000,000 took 15 s with the normalization
 
 
-def test_the_gram_matrix_of_many_points_is_not_silent() -> None:
+def test_the_gram_matrix_of_many_points_polls_for_a_stop() -> None:
     points = np.random.default_rng(0).standard_normal((3, 2 * CHUNKS_PER_TICK * POINTS_PER_CHUNK, 2))
     asked = []
     complete(normalize(Tracks.from_arrays(points)), seed=0, should_stop=lambda: bool(asked.append(1)))

@@ -97,7 +97,7 @@ def test_cameras_project_and_the_prior_states_its_covariance(cameras: Cameras, p
     assert prior.walk_variance > 0
 
 
-def test_what_is_printed_is_short(cameras: Cameras, prior: Prior, solution: Solution) -> None:
+def test_reprs_are_short(cameras: Cameras, prior: Prior, solution: Solution) -> None:
     assert repr(cameras) == "<Cameras of 8 frames, orthographic>"
     assert repr(prior).startswith("<Prior of 8 frames: ")
     assert repr(solution).startswith(f"<Solution of 8 frames × {MADE.tracks.num_points} points, converged")
@@ -111,7 +111,7 @@ def test_one_noise_is_used_and_reported(prior: Prior, solution: Solution) -> Non
     assert choices.temporal_weight * 8**0.5 * choices.unit == pytest.approx(choices.noise, rel=1e-12)
 
 
-def test_a_start_at_the_solution_ends_there_at_once(cameras: Cameras, prior: Prior, solution: Solution) -> None:
+def test_starting_at_the_solution_converges_at_once(cameras: Cameras, prior: Prior, solution: Solution) -> None:
     again = solve_shapes(MADE.tracks, cameras, prior, MADE.mesh, start=solution)
     assert len(again.trace.objective) <= 3 < len(solution.trace.objective)
     assert again.trace.objective[-1] <= solution.trace.objective[-1] * (1 + 1e-9)
@@ -119,7 +119,7 @@ def test_a_start_at_the_solution_ends_there_at_once(cameras: Cameras, prior: Pri
     np.testing.assert_allclose(again.choices.spatial_weight, solution.choices.spatial_weight)
 
 
-def test_a_start_elsewhere_has_the_same_energy_and_ends_at_the_same_shapes(
+def test_a_perturbed_start_converges_to_the_same_energy_and_shapes(
     cameras: Cameras, prior: Prior, solution: Solution
 ) -> None:
     given = solution.shapes + 0.05 * solution.choices.unit * np.random.default_rng(0).normal(size=solution.shapes.shape)
@@ -131,7 +131,7 @@ def test_a_start_elsewhere_has_the_same_energy_and_ends_at_the_same_shapes(
     assert metrics.e3d_frame(away.shapes, here.shapes) < 0.02
 
 
-def test_shapes_of_other_points_follow_from_cameras_and_prior_of_some(solution: Solution) -> None:
+def test_cameras_and_prior_of_some_points_give_the_shapes_of_all(solution: Solution) -> None:
     some = Tracks.from_arrays(MADE.tracks.points[:, ::2])
     cameras = estimate_cameras(some, KNOWN)
     found = solve_shapes(MADE.tracks, cameras, learn_prior(some, cameras), MADE.mesh)
@@ -165,7 +165,7 @@ def test_every_stage_reports_its_steps_and_its_end(cameras: Cameras, prior: Prio
         assert len(fractions) > 1 or run.__code__.co_names[0] == "find_outliers"
 
 
-def test_every_stage_stops(cameras: Cameras, prior: Prior) -> None:
+def test_every_stage_can_be_stopped(cameras: Cameras, prior: Prior) -> None:
     early = estimate_cameras(SPOILED, should_stop=lambda: True)
     assert early.stopped
     assert np.isfinite(early.camera.rotations).all()
@@ -181,8 +181,7 @@ def test_every_stage_stops(cameras: Cameras, prior: Prior) -> None:
 
 
 @pytest.mark.slow
-def test_the_seed_reaches_every_random_choice(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each generator that a solve makes has the seed of the settings."""
+def test_every_random_generator_uses_the_seed_of_the_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     made, original = set(), np.random.default_rng
 
     def seeded(seed: object = None) -> np.random.Generator:
@@ -210,7 +209,7 @@ def test_the_seed_reaches_every_random_choice(monkeypatch: pytest.MonkeyPatch) -
     }
 
 
-def test_inputs_that_do_not_belong_together_are_refused(cameras: Cameras, prior: Prior, solution: Solution) -> None:
+def test_mismatched_inputs_are_rejected(cameras: Cameras, prior: Prior, solution: Solution) -> None:
     tracks = MADE.tracks
     fewer = Tracks.from_arrays(tracks.points[:6])
     short = estimate_cameras(fewer, KnownCamera.from_arrays(MADE.rotations[:6], MADE.scales[:6]))
@@ -225,5 +224,5 @@ def test_inputs_that_do_not_belong_together_are_refused(cameras: Cameras, prior:
         with pytest.raises(InvalidInput) as caught:
             call()
         assert caught.value.field == field
-    with pytest.raises(InvalidSettings, match="beside a learned prior"):
+    with pytest.raises(InvalidSettings, match="with a learned prior"):
         solve_shapes(tracks, cameras, prior, settings=Settings(prior="smooth"))

@@ -35,7 +35,7 @@ class TestTracks:
         assert np.isfinite(tracks.points).all()
         assert not tracks.all_visible
 
-    def test_confidence_is_kept_and_false_is_hidden(self) -> None:
+    def test_fractional_confidence_is_kept_and_zero_is_hidden(self) -> None:
         visible = np.full((5, 6), 0.25)
         visible[4] = 0
         tracks = Tracks.from_arrays(POINTS, visible)
@@ -73,13 +73,13 @@ class TestTracks:
             (POINTS, np.full((5, 6), np.nan), "visibility", "out_of_range"),
         ],
     )
-    def test_refusals(self, points: Any, visible: Any, field: str, code: str) -> None:
+    def test_invalid_tracks_are_rejected(self, points: Any, visible: Any, field: str, code: str) -> None:
         error = refusal(Tracks.from_arrays, points, visible)
         assert (error.field, error.code) == (field, code)
 
 
 class TestMesh:
-    def test_edges_of_two_triangles_are_five_each_once(self) -> None:
+    def test_two_triangles_have_five_unique_edges(self) -> None:
         mesh = Mesh.from_faces([[0, 1, 2], [2, 1, 3]], 4)
         assert mesh.edges.tolist() == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]
 
@@ -89,7 +89,7 @@ class TestMesh:
     def test_no_faces_have_no_edges(self) -> None:
         assert Mesh.from_faces([], 4).edges.shape == (0, 2)
 
-    def test_a_grid_leaves_out_the_quads_that_touch_a_hole(self) -> None:
+    def test_grid_quads_that_touch_a_hole_are_omitted(self) -> None:
         full = Mesh.from_grid(np.arange(12).reshape(3, 4))
         assert (full.num_points, len(full.faces)) == (12, 6)
         holed = np.array([[0, 1, 2], [3, -1, 4], [5, 6, 7]])
@@ -98,7 +98,7 @@ class TestMesh:
         corner = np.array([[-1, 0, 1], [2, 3, 4]])
         assert Mesh.from_grid(corner).faces.tolist() == [[0, 3, 4, 1]]
 
-    def test_grid_quads_turn_counter_clockwise_seen_with_rows_downward(self) -> None:
+    def test_grid_quads_are_counter_clockwise_with_rows_downward(self) -> None:
         (face,) = Mesh.from_grid([[0, 1], [2, 3]]).faces.tolist()
         assert face == [0, 2, 3, 1]
 
@@ -113,7 +113,7 @@ class TestMesh:
             ([[0, 1, 2], [1, 1, 3]], "degenerate_face"),
         ],
     )
-    def test_face_refusals(self, faces: Any, code: str) -> None:
+    def test_invalid_faces_are_rejected(self, faces: Any, code: str) -> None:
         error = refusal(Mesh.from_faces, faces, 4)
         assert (error.field, error.code) == ("mesh.faces", code)
 
@@ -127,7 +127,7 @@ class TestMesh:
             ([[-1, -1]], "index_out_of_range"),
         ],
     )
-    def test_grid_refusals(self, grid: Any, code: str) -> None:
+    def test_invalid_grids_are_rejected(self, grid: Any, code: str) -> None:
         error = refusal(Mesh.from_grid, grid)
         assert (error.field, error.code) == ("mesh.grid", code)
 
@@ -158,7 +158,7 @@ class TestKnownCamera:
             (np.tile(np.eye(3), (4, 1, 1)), np.full(4, np.inf), "scales", "wrong_shape"),
         ],
     )
-    def test_refusals(self, rotations: Any, scales: Any, field: str, code: str) -> None:
+    def test_invalid_cameras_are_rejected(self, rotations: Any, scales: Any, field: str, code: str) -> None:
         error = refusal(KnownCamera.from_arrays, rotations, scales)
         assert (error.field, error.code) == (field, code)
 

@@ -37,7 +37,7 @@ def test_the_largest_confidence_counts_as_1() -> None:
 
 @pytest.mark.parametrize("prior", ["gaussian", "smooth"])
 def test_a_common_factor_of_all_confidences_changes_nothing(prior: str) -> None:
-    settings = Settings(prior=prior, max_reweightings=5)
+    settings = Settings(prior=prior, max_reweightings=5, basis_size=2)
     whole, part = (solve(at(each), FACE.mesh, settings=settings) for each in (1.0, 0.25))
     assert part.shapes == pytest.approx(whole.shapes, abs=1e-9 * size_of(whole.shapes))
     assert part.inlier_probability == pytest.approx(whole.inlier_probability, nan_ok=True)
@@ -46,7 +46,7 @@ def test_a_common_factor_of_all_confidences_changes_nothing(prior: str) -> None:
 
 
 @pytest.mark.slow
-def test_nor_does_it_between_the_stages() -> None:
+def test_stages_agree_on_a_subset_of_points_with_scaled_confidences() -> None:
     tracks = at(0.25)
     cameras = estimate_cameras(tracks, settings=Settings(max_reweightings=5))
     prior = learn_prior(tracks, cameras)
@@ -57,7 +57,7 @@ def test_nor_does_it_between_the_stages() -> None:
     assert solve_shapes(half, cameras, prior).choices.noise == pytest.approx(whole.choices.noise)
 
 
-def test_weights_of_an_isometric_surface_do_not_hold_the_confidence() -> None:
+def test_weights_of_an_isometric_surface_exclude_the_confidence() -> None:
     settings = Settings(surface="isometric", focal=FOCAL, image_size=SIZE, order="film")
     found = solve(at(0.25, rolled(frames=6, side=5).tracks), settings=settings)
     assert set(np.unique(found.weights)) <= {0.0, 1.0}

@@ -45,7 +45,7 @@ def test_every_method_gives_finite_centred_shapes_that_explain_the_tracks(method
     assert np.median(found.residuals) < 0.1
 
 
-def test_smoothness_gives_depth_that_the_pseudo_inverse_does_not() -> None:
+def test_temporal_smoothness_recovers_depth_unlike_the_pseudo_inverse() -> None:
     shapes, rotations, tracks, mesh = scene()
     flat, deep = (
         error(solve(tracks, mesh, cameras=cameras_of(rotations), settings=Settings(method=method)).shapes, 5 * shapes)
@@ -57,7 +57,7 @@ def test_smoothness_gives_depth_that_the_pseudo_inverse_does_not() -> None:
 
 @pytest.mark.slow
 def test_estimated_cameras_and_a_mesh_run_end_to_end() -> None:
-    _, _, tracks, _ = scene(10)  # enough frames for modes that have axes of their own
+    _, _, tracks, _ = scene(10)  # enough frames for modes with their own axes
     steps: list[Step] = []
     found = solve(tracks, triangulated(sheet()[1]), on_step=steps.append)
     assert found.outcome is Outcome.CONVERGED
@@ -68,10 +68,12 @@ def test_estimated_cameras_and_a_mesh_run_end_to_end() -> None:
     assert (np.diff(found.trace.objective) <= 0).all()
 
 
-def test_the_same_call_gives_the_same_bits() -> None:
-    face = gallery.face(4, 20)
+@pytest.mark.parametrize("basis_size", [1, pytest.param(None, marks=pytest.mark.slow)])
+def test_the_same_call_gives_the_same_bits(basis_size: int | None) -> None:
+    face, settings = gallery.face(4, 20), Settings(basis_size=basis_size)
     steps: list[Step] = []
-    one, two = solve(face.tracks, face.mesh, on_step=steps.append), solve(face.tracks, face.mesh)
+    one = solve(face.tracks, face.mesh, settings=settings, on_step=steps.append)
+    two = solve(face.tracks, face.mesh, settings=settings)
     assert steps[-1].fraction == 1
     for name in ("shapes", "residuals", "weights"):
         assert np.array_equal(getattr(one, name), getattr(two, name))
@@ -87,14 +89,14 @@ def test_stopping_returns_the_last_shapes_with_outcome_stopped() -> None:
     assert np.isfinite(found.shapes).all()
 
 
-def test_a_mesh_of_another_size_is_refused() -> None:
+def test_a_mesh_with_another_vertex_count_is_rejected() -> None:
     _, _, tracks, _ = scene()
     with pytest.raises(InvalidInput, match="63 vertices") as caught:
         solve(tracks, Mesh.from_faces([[0, 1, 2]], 64))
     assert caught.value.code == "mesh_mismatch"
 
 
-def test_cameras_of_another_length_are_refused() -> None:
+def test_cameras_with_another_frame_count_are_rejected() -> None:
     _, rotations, tracks, _ = scene()
     with pytest.raises(InvalidInput, match="12 rotations") as caught:
         solve(tracks, cameras=KnownCamera.from_arrays(rotations[:5]))

@@ -14,7 +14,7 @@ from pliant.solver.storage import allocated, let_go
 POINTS = np.random.default_rng(0).normal(size=(5, 6, 2)).astype(np.float32)
 
 
-def test_mapped_arrays_are_zeros_that_keep_what_is_written(tmp_path: Path) -> None:
+def test_mapped_arrays_start_at_zero_and_keep_written_values(tmp_path: Path) -> None:
     array = allocated((3, 4), tmp_path)
     assert type(array) is np.ndarray
     assert (array == 0).all()

@@ -18,26 +18,26 @@ def many_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def threads_at_once(count: int) -> int:
-    """How many threads `over_ranges` really has at work at the same time."""
+    """How many threads `over_ranges` runs at the same time."""
     seen: set[int] = set()
     meet = threading.Barrier(min(count, available_cores()))
 
     def work(start: int, stop: int) -> None:
-        meet.wait(timeout=10)  # broken, and so an error, if fewer come
+        meet.wait(timeout=10)  # raises if fewer threads arrive
         seen.add(threading.get_ident())
 
     over_ranges(work, count)
     return len(seen)
 
 
-def test_a_solve_takes_the_cores_that_the_process_may_use(many_cores: None) -> None:
+def test_work_uses_the_cores_available_to_the_process(many_cores: None) -> None:
     assert available_cores() == 4
     assert threads_at_once(100) == 4
     assert threads_at_once(3) == 3
 
 
 @pytest.mark.parametrize(("limit", "threads"), [(1, 1), (3, 3), (50, 4), (None, 4)])
-def test_a_limit_is_kept_and_ends_with_the_block(many_cores: None, limit: int | None, threads: int) -> None:
+def test_a_thread_limit_holds_only_inside_its_block(many_cores: None, limit: int | None, threads: int) -> None:
     with threads_limited(limit):
         assert available_cores() == threads
         assert threads_at_once(100) == threads
@@ -47,7 +47,7 @@ def test_a_limit_is_kept_and_ends_with_the_block(many_cores: None, limit: int | 
     assert available_cores() == 4
 
 
-def test_a_limit_is_the_caller_s_own(many_cores: None) -> None:
+def test_a_thread_limit_does_not_affect_other_threads(many_cores: None) -> None:
     elsewhere: list[int] = []
     with threads_limited(1):
         other = threading.Thread(target=lambda: elsewhere.append(available_cores()))
@@ -56,7 +56,7 @@ def test_a_limit_is_the_caller_s_own(many_cores: None) -> None:
     assert elsewhere == [4]
 
 
-def test_less_than_one_thread_is_refused() -> None:
+def test_a_limit_below_one_thread_is_rejected() -> None:
     with pytest.raises(ValueError, match="at least 1 thread, got 0"), threads_limited(0):
         pass
 
@@ -64,7 +64,7 @@ def test_less_than_one_thread_is_refused() -> None:
 def test_the_result_does_not_depend_on_the_number_of_threads(many_cores: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         normal_equations, "SMALLEST", 1, raising=False
-    )  # or so small a sequence would be left to one thread
+    )  # otherwise one thread would handle so small a sequence
     made = gallery.corrupt(gallery.face(8, 120), outliers=0.1, seed=2)
     cameras = KnownCamera.from_arrays(made.rotations, made.scales)
 

@@ -29,7 +29,7 @@ from pliant.solver.tracks.normalization import normalize
 
 
 def turning(frames: int, degrees: float) -> np.ndarray:
-    """A camera that pans to and fro and nods."""
+    """A camera that pans back and forth and nods."""
     time = np.linspace(0, 2 * np.pi, frames)
     half = np.radians(degrees)
     return start_at_identity(
@@ -45,7 +45,7 @@ RIGID = np.random.default_rng(3).normal(size=(60, 3)) * [1.0, 0.8, 0.5]
 CAMERA = turning(20, 40)
 
 
-def test_a_rigid_scene_is_exact() -> None:
+def test_cameras_of_a_rigid_scene_are_exact() -> None:
     found = estimate_cameras(normalize(Tracks.from_arrays(view(RIGID, CAMERA) * 7 + 3)), Settings())
     assert degrees_apart(found.rotations, CAMERA) < 0.1
     np.testing.assert_allclose(found.rotations[0], np.eye(3), atol=1e-12)
@@ -55,7 +55,7 @@ def test_a_rigid_scene_is_exact() -> None:
     assert set(found.reasons) == {"basis_size", "scales", "rotations"}
 
 
-def test_a_low_rank_scene_is_exact_with_its_basis_size() -> None:
+def test_cameras_of_a_low_rank_scene_need_its_basis_size() -> None:
     random = np.random.default_rng(0)
     camera = turning(60, 70)
     play = 0.3 * np.sin(np.linspace(0, 9, 60))[:, None, None]
@@ -118,7 +118,7 @@ def test_the_same_seed_gives_the_same_bits_and_stopping_returns() -> None:
 
 
 @pytest.mark.parametrize("with_scales", [True, False])
-def test_the_gradient_is_that_of_the_energy(with_scales: bool) -> None:
+def test_the_gradient_matches_finite_differences_of_the_energy(with_scales: bool) -> None:
     random = np.random.default_rng(0)
     tracks = random.normal(size=(14, 30))
     scene = Scene.of(tracks @ tracks.T / 30, exponential(random.normal(0, 0.3, (7, 3))), with_scales=with_scales)
@@ -143,7 +143,7 @@ def test_the_exponential_map_and_its_jacobian() -> None:
     np.testing.assert_allclose(exponential(vector + small), moved, atol=1e-11)
 
 
-def test_logarithms_are_those_of_the_exponentials() -> None:
+def test_the_logarithm_inverts_the_exponential_map() -> None:
     random = np.random.default_rng(0)
     axes = random.normal(size=(40, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -174,7 +174,7 @@ def test_corrections_are_carried_to_the_frames_between() -> None:
     assert degrees_apart(truth @ exponential(-drift), truth) > 3
 
 
-def test_candidates_of_a_long_film_are_carried_on_their_own_factorizations(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_candidates_of_a_long_film_are_extended_by_their_own_factorizations(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(multistart, "MULTISTART_FRAMES", 10)
     monkeypatch.setattr(estimation, "run_multistart", lambda _, entries, **__: (entries[0], entries))  # unrefined
     found = estimate_cameras(normalize(gallery.face(20, 60, degrees=60).tracks), Settings())
@@ -187,8 +187,8 @@ def test_candidates_of_a_long_film_are_carried_on_their_own_factorizations(monke
 
 
 @pytest.mark.slow
-def test_a_deforming_body_does_not_move_a_static_camera() -> None:
-    # limbs that swing as fast as the camera turns: every K gives cameras that jitter with them
+def test_swinging_limbs_do_not_make_the_cameras_jitter() -> None:
+    # limbs swing as fast as the camera turns: the cameras of every K jitter with them
     random = np.random.default_rng(2)
     time = np.linspace(0, 1, 40)
     camera = start_at_identity(exponential(np.stack([0 * time, 2.0 * time, 0 * time], axis=1)))
@@ -205,8 +205,8 @@ def test_a_deforming_body_does_not_move_a_static_camera() -> None:
 
 @pytest.mark.parametrize(("frames", "points", "most"), [(40, 300, 0.09), (60, 400, 0.11)])
 @pytest.mark.slow
-def test_a_body_that_hides_its_back_is_completed(frames: int, points: int, most: float) -> None:
-    # no point is always seen: without a prior on the coefficients, points seen seldom fly off (.105 and .123)
+def test_tracks_of_a_self_occluding_body_are_completed(frames: int, points: int, most: float) -> None:
+    # no point is always seen: without a prior on the coefficients, sparsely observed points diverge (.105 and .123)
     body = gallery.sphere(frames, points)
     normalized = normalize(body.tracks)
     whole = view(body.shapes, body.rotations) * body.scales[:, None, None] / normalized.unit

@@ -53,7 +53,7 @@ def test_a_sheet_has_no_further_starts() -> None:
 
 
 @pytest.mark.slow
-def test_cameras_with_implausible_depth_are_no_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cameras_with_implausible_depth_are_not_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
     face = gallery.face(16, 120)
     monkeypatch.setattr("pliant.solver.cameras.estimation.MAX_START_DEPTH_VARIANCE", 0.0)
     assert not estimate_cameras(normalize(face.tracks), Settings()).hypotheses
@@ -67,7 +67,7 @@ def test_the_start_that_leads_to_the_higher_likelihood_is_chosen(
 ) -> None:
     monkeypatch.setattr(
         "pliant.solver.model.full_mode_covariance.POINTS_PER_COEFFICIENT", np.inf
-    )  # it would mend either start
+    )  # it would correct either start
     random, time = np.random.default_rng(2), np.linspace(0, 1, FRAMES)
     true = exponential(np.stack([0.3 * np.sin(6 * time), np.sin(4 * time), 0.1 * time], axis=1))
     modes = np.stack([0.2 * np.sin(2 * np.pi * time), 0.2 * np.sin(3 * np.pi * time)], axis=1)

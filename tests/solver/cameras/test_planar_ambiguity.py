@@ -25,7 +25,7 @@ PLANE = np.random.default_rng(4).uniform(-1, 1, (80, 3)) * [1.0, 0.7, 0.0]
 
 
 def swaying(frames: int, degrees: float = 35.0) -> np.ndarray:
-    """A camera that goes to and fro before the plane, past the front, and nods."""
+    """A camera that sways in front of the plane, past the frontal view, and nods."""
     time = np.linspace(0, 2 * np.pi, frames)
     return exponential(np.radians(degrees) * np.stack([0.5 * np.sin(2 * time), np.cos(time), 0.1 * time], axis=1))
 
@@ -61,7 +61,7 @@ def test_the_smoothest_pose_signs_are_those_of_a_smooth_camera() -> None:
     spin = exponential(np.linspace(-0.6, 0.6, 30)[:, None] * np.array([0.1, 1.0, 0.0]))
     wrong = np.random.default_rng(0).random(30) < 0.4
     assert len({*(smoothest_signs(reversed_at(spin, MIRROR, wrong), 2) ^ wrong)}) == 1
-    # where the plane faces the camera, turning on and turning back are as far: order 1 leaves that open
+    # in the frontal view, both signs need the same rotation: order 1 cannot decide
     least = reversed_at(spin, MIRROR, smoothest_signs(reversed_at(spin, MIRROR, wrong), 1) ^ wrong)
     assert angles_between(least[1:], least[:-1]).max() < 1.01 * angles_between(spin[1:], spin[:-1]).max()
 
@@ -74,18 +74,18 @@ def test_only_sheets_are_detected_as_planar() -> None:
 
 
 @pytest.mark.parametrize("noise", [1e-16, 1e-6])
-def test_points_on_one_line_lie_in_a_plane_whatever_noise_is_left(noise: float) -> None:
+def test_collinear_points_are_planar_at_any_residual_noise(noise: float) -> None:
     assert is_planar(np.ones((6, 6)) + noise * np.diag([0.0, 5.0, 4.0, 3.0, 2.0, 1.0]))
     assert not is_planar(np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]))
     assert not is_planar(np.zeros((0, 0)))
 
 
-def test_points_on_one_line_in_most_pictures_are_recognised() -> None:
+def test_points_collinear_in_most_frames_are_detected() -> None:
     along, angle = np.linspace(-1, 1, 9)[None, :], np.linspace(0, 3, 7)[:, None]
     points = 300 + 100 * np.stack([along * np.cos(angle), along * np.sin(angle)], axis=2)
     visible = np.ones((7, 9))
     assert on_one_line(Tracks.from_arrays(points, visible))
-    visible[:2, 2:] = 0  # frames that show too little say nothing
+    visible[:2, 2:] = 0  # frames that show too few points do not count
     points[2:4] = np.random.default_rng(0).normal(size=(2, 9, 2))
     assert on_one_line(Tracks.from_arrays(points, visible))
     points[4] = points[2]
@@ -109,11 +109,11 @@ def test_the_pose_signs_of_a_flag_are_found(flag: gallery.Sequence) -> None:
     assert "sheet" in found.choices.reasons["rotations"]
 
 
-def test_correct_pose_signs_are_kept(flag: gallery.Sequence) -> None:
+def test_the_reason_states_whether_pose_signs_were_kept(flag: gallery.Sequence) -> None:
     gram, truth = complete(normalize(flag.tracks)).gram, np.asarray(flag.rotations)
     best = fitted(gram, truth, np.ones(24), iterations=400)
     kept, _, sentence = resolve_pose_signs(gram, best.rotations, should_stop=lambda: True)
-    assert ("as they were" in sentence) == (kept is best.rotations)
+    assert ("are unchanged" in sentence) == (kept is best.rotations)
 
 
 @pytest.mark.slow
@@ -127,11 +127,12 @@ def test_pose_signs_of_a_long_sequence_are_found_on_a_subset_of_frames(monkeypat
     assert steps.max() < 20
 
 
+@pytest.mark.long
 @pytest.mark.slow
-def test_given_cameras_that_reversals_make_more_probable_get_an_alternative() -> None:
+def test_more_probable_reversed_poses_are_offered_as_an_alternative() -> None:
     small = gallery.flag(16, 100)
     found = estimate_cameras(normalize(small.tracks), Settings())
-    assert "as they were. With some of them reversed" in found.reasons["rotations"]
+    assert "unchanged. Cameras with some poses reversed" in found.reasons["rotations"]
     (alternative,) = found.hypotheses
     assert "With the shapes, reversed poses of some frames lead" in restarted(found, alternative).reasons["basis_size"]
     given, other = (fitted(found.gram, each.rotations, np.ones(16)).energy for each in (found, alternative))
@@ -146,19 +147,19 @@ def test_a_stop_keeps_the_given_cameras(flag: gallery.Sequence) -> None:
     kept, none, sentence = resolve_pose_signs(gram, given, should_stop=lambda: True)
     assert kept is given
     assert none is None
-    assert "as they were" in sentence
+    assert "are unchanged" in sentence
 
 
 @pytest.mark.slow
-def test_orthography_as_set_keeps_the_scales() -> None:
+def test_the_orthographic_setting_keeps_unit_scales() -> None:
     tracks = gallery.flag(10, 100).tracks
     assert (solve(tracks, settings=Settings(camera="orthographic")).camera.scales == 1).all()
 
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_sheet_with_outliers_keeps_its_pose_signs() -> None:
-    """What stands in for outliers is enough to turn a sheet over: its cameras are not refined with the shapes."""
+def test_cameras_of_a_sheet_with_outliers_are_not_refined_jointly() -> None:
+    """The values that replace outliers are enough to flip the pose of a sheet."""
     film = gallery.flag(24, 300)
     spoiled = gallery.corrupt(film, outliers=0.05, hidden=0.2, noise=0.01, seed=0).tracks
     found, clean = solve(spoiled, film.mesh), solve(film.tracks, film.mesh)

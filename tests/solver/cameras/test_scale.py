@@ -42,9 +42,9 @@ def test_implausibly_large_scale_changes_are_rejected(monkeypatch: pytest.Monkey
     # Neither the rigid scales nor those found with the shapes may vary more.
     for module in ("cameras.scale", "refinement.free_scales"):
         monkeypatch.setattr(f"pliant.solver.{module}.WIDEST", 0.02)
-    found = solve(film.tracks, settings=Settings(max_reweightings=1))
+    found = solve(film.tracks, settings=Settings(max_reweightings=1, basis_size=1))
     assert (found.camera.scales == 1).all()
-    assert "wider apart than any camera's" in found.choices.reasons["scales"]
+    assert "vary more than those of any camera" in found.choices.reasons["scales"]
 
 
 def test_scales_of_given_rotations_are_more_accurate_than_those_of_a_rigid_shape() -> None:

@@ -18,7 +18,7 @@ def face() -> gallery.Sequence:
 
 
 def solved(sequence: gallery.Sequence, tracks: Tracks, *, mesh: bool = True, **settings: Any) -> Solution:
-    """Solve with the true cameras, whose estimation takes ten times as long as everything that is asked here."""
+    """Solve with the true cameras; estimating them would take ten times as long as all that is tested here."""
     cameras = KnownCamera.from_arrays(sequence.rotations, sequence.scales)
     return solve(tracks, sequence.mesh if mesh else None, cameras=cameras, settings=Settings(**settings))
 
@@ -32,14 +32,14 @@ def error(sequence: gallery.Sequence, tracks: Tracks, **settings: Any) -> float:
     return metrics.e3d_frame(solved(sequence, tracks, **settings).shapes, sequence.shapes)
 
 
-def test_the_paper_preset_is_the_paper(face: gallery.Sequence) -> None:
+def test_the_paper_preset_uses_the_published_weights(face: gallery.Sequence) -> None:
     chosen = solved(face, face.tracks, preset="paper", max_reweightings=1).choices
     assert (chosen.temporal_weight, chosen.spatial_weight, chosen.low_rank_weight) == (1e-3, 1.0, 0.0)
     assert (chosen.robust_scale, chosen.temporal_order) == (1e-3, 1)
     assert PAPER.temporal == 1e-3
 
 
-def test_what_is_given_wins_over_every_preset(face: gallery.Sequence) -> None:
+def test_given_weights_override_the_automatic_ones(face: gallery.Sequence) -> None:
     given = {"temporal_weight": 0.5, "spatial_weight": 0.25, "robust_scale": 0.125, "temporal_order": 2}
     chosen = solved(face, face.tracks, max_reweightings=1, **given).choices
     assert (chosen.temporal_weight, chosen.spatial_weight, chosen.robust_scale) == (0.5, 0.25, 0.125)
@@ -69,9 +69,7 @@ def test_a_weight_without_effect_gives_a_warning(face: gallery.Sequence) -> None
     assert not any("no effect" in warning for warning in plain.warnings)
 
 
-def test_the_gaussian_prior_is_solved_in_double_precision_whatever_is_set(
-    face: gallery.Sequence, default: Solution
-) -> None:
+def test_the_gaussian_prior_is_always_solved_in_double_precision(face: gallery.Sequence, default: Solution) -> None:
     assert Settings().precision == "float64"
     single = solved(face, face.tracks, precision="float32")
     np.testing.assert_array_equal(single.shapes, default.shapes)

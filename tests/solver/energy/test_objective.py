@@ -22,7 +22,7 @@ HOLED = np.where((GRID % 9 == 4) & (GRID > 18) & (GRID < 45), -1, GRID)
 
 
 def renumbered(grid: np.ndarray) -> np.ndarray:
-    """Number the cells that are left without gaps."""
+    """Renumber the remaining cells without gaps."""
     result = np.full(grid.shape, -1)
     result[grid >= 0] = np.arange((grid >= 0).sum())
     return result
@@ -155,7 +155,7 @@ def test_corrections_in_single_precision_lead_to_the_same_energy(mesh: str, monk
     monkeypatch.setattr(block_tridiagonal, "SINGLE_SPAN", 0.0)
     double = descended()
     assert single.shapes.dtype == np.float64
-    assert not np.array_equal(single.shapes, double.shapes)  # or single precision was not taken
+    assert not np.array_equal(single.shapes, double.shapes)  # otherwise single precision was not used
     np.testing.assert_allclose(single.objective, double.objective, rtol=1e-6)
 
 

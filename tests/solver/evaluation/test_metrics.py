@@ -1,4 +1,4 @@
-"""The metrics, parsed by the Prometheus client library."""
+"""Error metrics: invariances, values worked by hand, and rejected input."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ def test_identity_and_translation_cost_nothing(metric):
 
 @pytest.mark.parametrize("metric", ALL)
 @pytest.mark.parametrize("mirror", [np.eye(3), MIRROR, -np.eye(3)])
-def test_one_orthogonal_matrix_for_the_sequence_is_always_free(metric, mirror):
+def test_every_metric_ignores_one_orthogonal_transform_per_sequence(metric, mirror):
     assert metric(TRUTH @ (mirror @ TURN).T, TRUTH) == pytest.approx(0, abs=1e-13)
 
 
-def test_a_rotation_per_frame_is_free_only_in_the_metrics_per_frame():
+def test_only_per_frame_metrics_ignore_per_frame_rotations():
     turned = TRUTH @ TURNS.transpose(0, 2, 1)
     assert e3d_frame(turned, TRUTH) == pytest.approx(0, abs=1e-13)
     assert e3d_frame_similarity(turned, TRUTH) == pytest.approx(0, abs=1e-13)
@@ -63,7 +63,7 @@ def test_a_rotation_per_frame_is_free_only_in_the_metrics_per_frame():
     assert e3d_mocap(turned, TRUTH) > 0.5
 
 
-def test_mirroring_half_of_the_frames_is_free_only_with_a_mirror_per_frame():
+def test_only_per_frame_mirroring_ignores_mirrored_frames():
     flipped = TRUTH.copy()
     flipped[::2] = flipped[::2] @ MIRROR
     assert e3d_frame_similarity(flipped, TRUTH) == pytest.approx(0, abs=1e-13)
@@ -77,7 +77,7 @@ def test_mirroring_half_of_the_frames_is_free_only_with_a_mirror_per_frame():
 
 
 @pytest.mark.parametrize("metric", [e3d_sequence, e3d_frame])
-def test_scale_counts_one_to_one_unless_it_is_free(metric):
+def test_scale_errors_count_fully_unless_scale_is_aligned(metric):
     assert metric(1.25 * TRUTH, TRUTH) == pytest.approx(0.25)
     assert metric(0.8 * TRUTH, TRUTH) == pytest.approx(0.2)
     assert e3d_frame_similarity(1.25 * TRUTH, TRUTH) == pytest.approx(0, abs=1e-13)
@@ -107,12 +107,12 @@ def test_mocap_error_worked_by_hand():
     assert point_errors(ours, truth, kind="sequence") == pytest.approx(np.full((3, 4), 0.3))
 
 
-def test_metrics_are_ordered_by_their_freedom():
+def test_more_alignment_freedom_gives_a_lower_error():
     ours = TRUTH @ TURN.T + 0.1 * random.standard_normal(TRUTH.shape)
     assert 0.05 < e3d_frame_similarity(ours, TRUTH) < e3d_frame(ours, TRUTH) < e3d_sequence(ours, TRUTH) < 0.15
 
 
-def test_alignment_beats_any_other_rotation_nearby():
+def test_procrustes_beats_nearby_rotations():
     products = random.standard_normal((3, 3))
     for proper in (False, True):
         best = procrustes(products, proper=proper)
@@ -133,7 +133,7 @@ def test_coverage_is_the_share_within_the_central_interval():
     )  # 90 % of a normal error lie within 1.645 deviations
     assert coverage(std, ours, truth) == pytest.approx(0.9, abs=0.015)
     assert coverage(0.5 * std, ours, truth) == pytest.approx(0.589, abs=0.02)  # P(|n| < .8225)
-    # One scale for the sequence is free, and the deviations take it too.
+    # One scale per sequence is aligned, and it applies to the deviations as well.
     assert coverage(7 * std, 7 * ours @ TURN.T, truth) == pytest.approx(coverage(std, ours, truth), abs=1e-3)
     with pytest.raises(InvalidInput, match="shapes_std"):
         coverage(std[:, 1:], ours, truth)
@@ -147,7 +147,7 @@ def test_rotation_degrees_ignores_world_axes_and_the_mirror_but_not_an_error():
     assert rotation_degrees(ours, true) == pytest.approx((2 + 1 + 0 + 1 + 2) / 5)
 
 
-def test_reprojection_weighs_with_confidence_and_skips_the_hidden():
+def test_reprojection_is_weighted_by_confidence_and_skips_hidden_points():
     shapes = np.zeros((3, 4, 3))
     shapes[:, :, :2] = [(0, 0), (1, 0), (0, 1), (1, 1)]
     scales, shift = np.array((1.0, 2.0, 0.5)), np.array([(5, 6)] * 3, dtype=float)
@@ -186,7 +186,7 @@ def test_evaluate_names_what_the_inputs_allow():
         (TRUTH, np.ones_like(TRUTH), "no_extent"),
     ],
 )
-def test_unusable_truth_is_refused(ours, truth, code):
+def test_unusable_shapes_are_rejected(ours, truth, code):
     with pytest.raises(InvalidInput) as caught:
         align(ours, truth)
     assert caught.value.code == code
@@ -197,7 +197,7 @@ def test_rotations_of_another_shape_are_refused():
         rotation_degrees(TURNS, TURNS[:, :2])
 
 
-def test_one_scale_for_the_sequence_is_free_and_no_more() -> None:
+def test_e3d_frame_scaled_aligns_one_scale_per_sequence() -> None:
     turned = 3.0 * np.einsum("fpi,fji->fpj", TRUTH, TURNS)
     assert e3d_frame_scaled(turned, TRUTH) == pytest.approx(0, abs=1e-9)
     growing = np.linspace(0.5, 1.5, 6)[:, None, None] * TRUTH

@@ -43,8 +43,8 @@ def test_a_result_without_reasons_against_it_is_good() -> None:
     [
         ({"residuals": np.full((FRAMES, POINTS), 0.2)}, Verdict.WITH_CARE, "miss the tracks"),
         ({"residuals": np.full((FRAMES, POINTS), 0.9)}, Verdict.DO_NOT_USE, "miss the tracks"),
-        ({"turn": 12.0}, Verdict.WITH_CARE, "turned by 12° only"),
-        ({"turn": 2.0}, Verdict.DO_NOT_USE, "turned by 2° only"),
+        ({"turn": 12.0}, Verdict.WITH_CARE, "turned by only 12°"),
+        ({"turn": 2.0}, Verdict.DO_NOT_USE, "turned by only 2°"),
         (
             {"shapes_std": np.full((FRAMES, POINTS), 0.2)},
             Verdict.WITH_CARE,
@@ -55,9 +55,9 @@ def test_a_result_without_reasons_against_it_is_good() -> None:
             Verdict.DO_NOT_USE,
             "may be as large as 200 % of the object's size",
         ),
-        ({"visible": np.eye(FRAMES, POINTS) + np.eye(FRAMES, POINTS, 12)}, Verdict.DO_NOT_USE, "are not seen"),
+        ({"visible": np.eye(FRAMES, POINTS) + np.eye(FRAMES, POINTS, 12)}, Verdict.DO_NOT_USE, "are hidden"),
         ({"planar": True}, Verdict.WITH_CARE, "A thin sheet, 45 % of its size off its plane"),
-        ({"depth_is_typical": True}, Verdict.WITH_CARE, "With 60° of turn the tracks hardly show"),
+        ({"depth_is_typical": True}, Verdict.WITH_CARE, "With 60° of turn the tracks hardly determine"),
         ({"modes": 7}, Verdict.WITH_CARE, "7 modes of deformation in 12 frames"),
         (
             {"held_out_error": 0.09},
@@ -89,7 +89,7 @@ def test_without_a_posterior_the_error_is_not_estimated() -> None:
     assert trust.sentence.startswith("The error is not estimated")
 
 
-def test_the_figures_of_the_signs_are_stated() -> None:
+def test_the_figures_behind_the_verdict_are_reported() -> None:
     trust = judged(held_out_error=0.01, turn=44.0)
     assert trust.verdict is Verdict.GOOD
     assert trust.held_out_error == 0.01
@@ -100,7 +100,7 @@ def test_the_figures_of_the_signs_are_stated() -> None:
     assert (unordered.held_out_error, unordered.degrees_per_frame, unordered.deformation_per_frame) == (None,) * 3
 
 
-def test_turn_and_deformation_per_frame_do_not_depend_on_size_translation_or_opposite_views() -> None:
+def test_per_frame_figures_ignore_size_translation_and_opposite_views() -> None:
     rng = np.random.default_rng(1)
     base = rng.normal(size=(POINTS, 3))
     shapes = np.stack([base, 1.1 * base, base, 1.1 * base])
@@ -112,7 +112,7 @@ def test_turn_and_deformation_per_frame_do_not_depend_on_size_translation_or_opp
     assert per_frame(shapes[:1], rotations[:1]) == (None, None)
 
 
-def test_fewer_frames_a_second_do_not_change_what_can_be_told_apart() -> None:
+def test_frame_rate_does_not_change_the_ratio_of_rotation_to_deformation() -> None:
     angles = np.linspace(0, 1, 41)
     base, moving = np.random.default_rng(2).normal(size=(2, POINTS, 3))
     shapes = base + 0.5 * angles[:, None, None] * moving
@@ -157,7 +157,7 @@ def test_noise_and_a_still_camera_give_do_not_use() -> None:
         assert found.trust.verdict is Verdict.DO_NOT_USE
 
 
-def test_without_the_weight_of_the_prior_there_is_no_expected_error() -> None:
+def test_a_prior_of_weight_zero_gives_no_expected_error() -> None:
     made = gallery.face(8, 60)
     cameras = KnownCamera.from_arrays(made.rotations, made.scales)
     found = solve(made.tracks, made.mesh, cameras=cameras, settings=Settings(temporal_weight=0.0))

@@ -1,4 +1,4 @@
-"""Halves of the frames must agree about the edge lengths: a real sheet's do, those of depths that explain nothing do not."""
+"""Two halves of the frames must agree on the edge lengths: they do for a real sheet, but not for wrong depths."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_halves_of_a_rolled_sheet_agree() -> None:
 
 
 @pytest.mark.slow
-def test_depths_along_the_rays_of_an_orthographic_flag_are_found_out_although_lengths_hardly_change() -> None:
+def test_wrong_depths_that_preserve_lengths_are_detected() -> None:
     search = search_of(gallery.flag(6, 40).tracks)
     focal = 400.0
     first = tried_at(search, focal, None)
@@ -41,7 +41,7 @@ def test_depths_along_the_rays_of_an_orthographic_flag_are_found_out_although_le
 
 
 @pytest.mark.slow
-def test_what_halves_do_not_confirm_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_surface_that_the_halves_do_not_confirm_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     tracks = rolled(frames=6, side=7).tracks
     monkeypatch.setattr(surface, "disagreement", lambda search, chosen: 0.4)
     refused = isometric_surface(tracks, focal=FOCAL, image_size=SIZE)
@@ -52,7 +52,7 @@ def test_what_halves_do_not_confirm_is_not_taken(monkeypatch: pytest.MonkeyPatch
     assert any("hardly support" in warning for warning in required.warnings)
 
 
-def test_fewer_than_two_frames_a_half_confirm_nothing() -> None:
+def test_fewer_than_two_frames_per_half_confirm_nothing() -> None:
     search = search_of(rolled(frames=4).tracks)
     chosen = tried_at(search, FOCAL, None)
     assert chosen is not None

@@ -1,4 +1,4 @@
-"""How nearly pictures are those of a plane."""
+"""How close images are to those of a plane."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def anchors_of(points: np.ndarray, seen: np.ndarray | None = None) -> Anchors:
 
 
 def pictures(shape: np.ndarray, turns: np.ndarray, distance: float) -> np.ndarray:
-    """Pictures `(F, P, 2)` of a rigid shape `(P, 3)` that turns before a pinhole camera, its size 1."""
+    """Images `(F, P, 2)` of a rigid shape `(P, 3)` of size 1 that turns in front of a pinhole camera."""
     placed = shape @ exponential(turns).transpose(0, 2, 1) + [0, 0, distance]
     return placed[..., :2] / placed[..., 2:]
 
@@ -31,12 +31,12 @@ def turns(degrees: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("distance", [1.8, 50.0])
-def test_pictures_of_a_plane_are_homographies_however_near_it_is(distance: float) -> None:
+def test_images_of_a_plane_are_homographies_at_any_distance(distance: float) -> None:
     plane = np.hstack([np.random.default_rng(0).uniform(-1, 1, (30, 2)), np.zeros((30, 1))])
     assert off_homography(anchors_of(pictures(plane, turns(35), distance))) < 1e-9
 
 
-def test_a_solid_is_off_by_its_depth() -> None:
+def test_a_solid_deviates_from_homographies_with_its_depth() -> None:
     random = np.random.default_rng(0)
     flat = random.uniform(-1, 1, (40, 2))
     off = [
@@ -47,7 +47,7 @@ def test_a_solid_is_off_by_its_depth() -> None:
     assert off[2] > 0.06
 
 
-def test_frames_that_share_too_little_do_not_count() -> None:
+def test_frames_with_too_few_common_points_are_ignored() -> None:
     plane = np.hstack([np.random.default_rng(0).uniform(-1, 1, (30, 2)), np.zeros((30, 1))])
     points = pictures(plane, turns(20), 5.0)
     points[5] = np.random.default_rng(1).normal(size=(30, 2))
@@ -58,12 +58,12 @@ def test_frames_that_share_too_little_do_not_count() -> None:
     assert off_homography(anchors_of(points, seen)) == np.inf
 
 
-def test_points_at_one_place_are_no_plane_and_no_error() -> None:
+def test_coincident_points_are_neither_planar_nor_an_error() -> None:
     assert unlike_homography(np.zeros((9, 2)), np.random.default_rng(0).normal(size=(9, 2))) > 0.1
 
 
 @pytest.mark.slow
-def test_a_sheet_that_turns_before_a_near_camera_is_taken_as_one() -> None:
+def test_a_sheet_near_the_camera_is_solved_as_isometric() -> None:
     sheet = rolled_sheet(bend=(0.2, 0.8))  # its third singular value is .22 of the second
     found = solve(sheet.tracks, settings=Settings(image_size=SIZE))
     assert found.choices.reasons["surface"].startswith("Taken as an isometric sheet")
@@ -71,15 +71,15 @@ def test_a_sheet_that_turns_before_a_near_camera_is_taken_as_one() -> None:
     assert one_scale_error(found.shapes @ found.camera.rotations.transpose(0, 2, 1), sheet.shapes) < 0.01
 
 
-def test_a_body_is_not_tried() -> None:
+def test_isometry_is_not_tested_for_a_solid_body() -> None:
     body = np.random.default_rng(0).normal(size=(60, 3)) * 0.4
     verdict = isometric_surface(Tracks.from_arrays(500 * pictures(body, turns(30), 4.0)), image_size=SIZE)
     assert verdict.surface is None
-    assert verdict.reason.startswith("Not tried as an isometric sheet: the pictures differ from those of a plane by")
+    assert verdict.reason.startswith("Isometry was not tested: the pictures differ from those of a plane by")
 
 
 @pytest.mark.slow
-def test_a_rigid_solid_is_no_sheet_although_it_keeps_all_lengths() -> None:
+def test_a_rigid_solid_is_not_a_sheet_although_it_preserves_lengths() -> None:
     across = np.stack(np.meshgrid(np.linspace(-1, 1, 8), np.linspace(-1, 1, 8)), axis=2).reshape(-1, 2)
     dome = np.column_stack([across, 0.25 * np.exp(-2 * np.square(across).sum(axis=1))])
     tracks = Tracks.from_arrays(500 * pictures(dome, turns(25), 4.0) + CENTRE)
@@ -90,7 +90,7 @@ def test_a_rigid_solid_is_no_sheet_although_it_keeps_all_lengths() -> None:
 
 
 @pytest.mark.slow
-def test_pairs_of_pictures_are_those_of_few_frames_however_long_the_film_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_film_is_compared_at_a_fixed_number_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     compared: list[int] = []
 
     def off(anchors: Anchors) -> float:

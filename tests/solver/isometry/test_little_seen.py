@@ -1,4 +1,4 @@
-"""Isometric surfaces of which some frames, or all, show little; and solves that are stopped."""
+"""Isometric surfaces that are sparsely observed in some or all frames, and stopped solves."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ GIVEN = Settings(surface="isometric", focal=FOCAL, image_size=SIZE, order="film"
     ],
     ids=["row", "row and one", "diagonal"],
 )
-def test_a_frame_that_shows_a_line_of_a_sheet_leaves_the_others_as_they_are(shown: range) -> None:
+def test_a_frame_that_shows_only_a_line_does_not_degrade_the_others(shown: range) -> None:
     sheet = rolled(frames=6, side=7)
     visible = np.ones(sheet.tracks.visible.shape)
     visible[2] = np.isin(np.arange(49), shown)
@@ -33,7 +33,7 @@ def test_a_frame_that_shows_a_line_of_a_sheet_leaves_the_others_as_they_are(show
 @pytest.mark.parametrize(
     "shown", [pytest.param(0, marks=pytest.mark.slow), pytest.param(5, marks=[pytest.mark.slow, pytest.mark.long])]
 )
-def test_a_frame_that_shows_too_little_is_like_its_neighbour_and_leaves_the_others_as_they_are(shown: int) -> None:
+def test_a_sparsely_observed_frame_is_filled_in_without_degrading_others(shown: int) -> None:
     sheet = rolled(frames=6, side=7)
     visible = np.ones(sheet.tracks.visible.shape)
     visible[2, shown:] = 0
@@ -45,7 +45,7 @@ def test_a_frame_that_shows_too_little_is_like_its_neighbour_and_leaves_the_othe
     assert any(warning.startswith("1 of 6 frames show too little") for warning in found.choices.warnings)
 
 
-def test_without_any_frame_that_shows_enough_nothing_is_filled_in() -> None:
+def test_nothing_is_filled_in_if_no_frame_shows_enough() -> None:
     points, seen = np.zeros((3, 7, 3)), np.zeros((3, 7), dtype=bool)
     filled, enough = complete_anchors(points, seen, np.random.default_rng(0).normal(size=(7, 2)))
     assert not enough.any()
@@ -53,7 +53,7 @@ def test_without_any_frame_that_shows_enough_nothing_is_filled_in() -> None:
 
 
 @pytest.mark.parametrize("required", [False, True])
-def test_points_that_are_hardly_seen_together_are_no_sheet(required: bool) -> None:
+def test_points_rarely_seen_together_are_not_taken_as_a_sheet(required: bool) -> None:
     flag, random = gallery.flag(30, 600), np.random.default_rng(0)
     visible = np.zeros((30, 600))
     for point in range(600):
@@ -78,7 +78,7 @@ def test_a_stop_while_the_surface_is_refined_is_reported(monkeypatch: pytest.Mon
     assert found.outcome is Outcome.STOPPED
 
 
-def test_a_stop_before_that_says_so() -> None:
+def test_a_stop_before_surface_refinement_is_reported() -> None:
     sheet = rolled(frames=6, side=7)
     verdict = surface.isometric_surface(
         sheet.tracks, focal=FOCAL, image_size=SIZE, required=True, should_stop=lambda: True

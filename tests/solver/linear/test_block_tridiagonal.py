@@ -18,7 +18,7 @@ GRID = sheet()[1]
 
 
 def operator(mesh: Mesh | None = None, *, frames: int = 6, **settings: object) -> Operator:
-    """At random shapes, so that inliers and outliers abound."""
+    """At random shapes, so that there are many inliers and outliers."""
     problem = small_problem(mesh, frames=frames, prior="smooth", **settings)  # type: ignore[arg-type]
     random = np.random.default_rng(7)
     shapes = random.standard_normal((frames, 3, problem.points.shape[2]))
@@ -29,14 +29,14 @@ def dense(apply: object, shape: tuple[int, ...]) -> np.ndarray:
     return np.stack([apply(unit.reshape(shape)).ravel() for unit in np.eye(int(np.prod(shape)))])  # type: ignore[operator]
 
 
-def test_without_neighbours_it_is_the_inverse() -> None:
+def test_the_preconditioner_is_the_exact_inverse_without_a_mesh() -> None:
     given = operator(hidden=0.1, temporal_weight=0.7)
     shape = (6, 3, given.weights.shape[2])
     product = dense(lambda x: block_tridiagonal.build(given)(given.apply(x)), shape)
     np.testing.assert_allclose(product, np.eye(len(product)), atol=1e-7)
 
 
-def test_with_neighbours_it_inverts_the_uncoupled_part() -> None:
+def test_the_preconditioner_inverts_the_block_of_each_point_with_a_mesh() -> None:
     given = operator(triangulated(GRID), temporal_weight=2.0)
     shape = (6, 3, given.weights.shape[2])
     whole = dense(given.apply, shape).reshape(shape * 2)
@@ -48,7 +48,7 @@ def test_with_neighbours_it_inverts_the_uncoupled_part() -> None:
     np.testing.assert_allclose(found @ alone.reshape(size, size), np.eye(size), atol=1e-6)
 
 
-def test_it_is_symmetric_and_positive_even_where_a_point_is_never_seen() -> None:
+def test_preconditioner_is_symmetric_positive_definite_with_unseen_points() -> None:
     given = operator(hidden=0.3, temporal_weight=0.7)
     given.weights[:, :, 5] = 0
     matrix = dense(block_tridiagonal.build(given), (6, 3, given.weights.shape[2]))
@@ -65,8 +65,8 @@ def test_blocks_of_points_and_threads_change_nothing(monkeypatch: pytest.MonkeyP
         np.testing.assert_array_equal(block_tridiagonal.build(given)(r), whole)
 
 
-def test_inliers_and_outliers_together_cost_few_iterations() -> None:
-    """What it is for: mean weights need more, though each costs a product over frames."""
+def test_individual_weights_need_fewer_iterations_than_mean_weights() -> None:
+    """The purpose of the preconditioner: mean weights need more, although each costs a product over frames."""
     given = operator(triangulated(GRID), frames=20, temporal_weight=30.0, spatial_weight=0.009, robust_scale=0.004)
     b = np.random.default_rng(2).standard_normal((20, 3, given.weights.shape[2]))
     mean = Diagonalised.of(given, b.dtype)

@@ -1,4 +1,4 @@
-"""Conjugate gradients: the decrease that they report, and where they end."""
+"""Conjugate gradients: the reported decrease, and when iterations end."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def inverse(x: np.ndarray, /, out: np.ndarray | None = None) -> np.ndarray:
 
 
 @pytest.mark.parametrize("iterations", [1, 7, 200])
-def test_the_decrease_is_that_of_the_quadratic(iterations: int) -> None:
+def test_the_reported_decrease_is_that_of_the_quadratic(iterations: int) -> None:
     found = conjugate_gradient(product, B, precondition=same, reduction=1e-9, max_iterations=iterations)
     value = float(np.vdot(found.x, product(found.x)) - 2 * np.vdot(B, found.x))
     assert found.decrease == pytest.approx(-value, rel=1e-6)
 
 
-def test_it_ends_where_little_is_left_to_gain() -> None:
-    whole = float(np.vdot(B, inverse(B)))  # with M = 𝒜, rᵀM⁻¹r is what is left to gain
+def test_iterations_end_when_the_remaining_gain_is_negligible() -> None:
+    whole = float(np.vdot(B, inverse(B)))  # with M = 𝒜, rᵀM⁻¹r is the remaining gain
     for share, expected in ((1.1, 0), (0.9, 1)):
         found = conjugate_gradient(
             product, B, precondition=inverse, reduction=1e-9, max_iterations=1, negligible=share * whole
@@ -42,7 +42,7 @@ def test_it_ends_where_little_is_left_to_gain() -> None:
         assert found.iterations == expected
 
 
-def test_a_stop_is_asked_for_before_the_first_product_and_in_every_iteration() -> None:
+def test_a_stop_is_polled_before_the_first_product_and_in_every_iteration() -> None:
     asked: list[int] = []
 
     def going_on() -> bool:

@@ -29,7 +29,7 @@ def test_points_with_equal_weights_need_no_correction() -> None:
     assert build_coarse(operator(hidden=0.0), np.zeros(90)) is None
 
 
-def test_it_inverts_the_equations_on_its_span() -> None:
+def test_the_coarse_correction_is_exact_on_its_span() -> None:
     given = operator(hidden=0.4)
     coarse = build_coarse(given, np.zeros(90))
     assert coarse is not None
@@ -43,7 +43,7 @@ def test_it_inverts_the_equations_on_its_span() -> None:
     np.testing.assert_allclose(found, shapes, atol=1e-7)
 
 
-def test_the_sum_of_all_parts_is_symmetric_and_positive() -> None:
+def test_the_whole_preconditioner_is_symmetric_and_positive() -> None:
     given = operator(hidden=0.4)
     precondition = points.build(given)
     one, two = np.random.default_rng(2).standard_normal((2, 18, 3, 90))
@@ -51,7 +51,7 @@ def test_the_sum_of_all_parts_is_symmetric_and_positive() -> None:
     assert np.vdot(precondition(one), one) > 0
 
 
-def test_hidden_points_cost_few_iterations() -> None:
+def test_the_correction_halves_the_iterations_with_hidden_points() -> None:
     given = operator(hidden=0.4)
     b = np.random.default_rng(3).standard_normal((18, 3, 90))
 

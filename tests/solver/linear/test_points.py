@@ -1,4 +1,4 @@
-"""The inverse for single points with a Gaussian prior: the modes bend too."""
+"""The per-point inverse with a Gaussian prior, whose modes bend as well."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def operator() -> Operator:
     return Operator(projections, weights, np.zeros((2, FRAMES)), build_laplacian(made.mesh, "auto"), 1e-3, None, prior)
 
 
-def test_without_bending_it_inverts_the_equations_with_the_diagonal() -> None:
+def test_the_inverse_is_exact_for_a_diagonal_stiffness() -> None:
     given = replace(operator(), laplacian=None)
     stiffness = np.full(given.weights.shape[2], 0.2)
     shapes = np.random.default_rng(0).standard_normal((FRAMES, 3, len(stiffness)))
@@ -38,7 +38,7 @@ def test_without_bending_it_inverts_the_equations_with_the_diagonal() -> None:
     np.testing.assert_allclose(found, shapes, atol=1e-6)
 
 
-def test_modes_that_bend_cost_few_iterations() -> None:
+def test_bending_modes_need_few_iterations() -> None:
     given = operator()
     assert bends(given)
     assert stiffness_of_neighbours(given).mean() > 0.01

@@ -20,7 +20,7 @@ PAIRS = exponential(np.stack([0.2 * np.sin(7 * TIME), 1.2 * np.sin(9 * TIME), 0.
 
 
 def drawn(points: int, *, modes: int, drift: float, seed: int = 0) -> np.ndarray:
-    """Images of points, shape (F, P, 2), whose deformation has so many smooth modes and a random walk."""
+    """Images of points, shape (F, P, 2), that deform along `modes` smooth modes and a random walk."""
     waves = np.stack([0.5 / (1 + k) * np.sin((k + 1) * np.pi * TIME + k) for k in range(modes)], axis=1)
     random = np.random.default_rng(seed)
     middle = random.standard_normal((points, 3)) * np.sqrt([0.2, 0.4, 0.6])
@@ -39,12 +39,12 @@ def gram_of(images: np.ndarray) -> np.ndarray:
 
 
 def both(images: np.ndarray) -> tuple[ShapeCovariance, ShapeCovariance, str]:
-    """What is learned in time, what is learned in full, and the reason."""
+    """The covariance with early stopping, the fully learned one, and the reason."""
     found, why = learn_with_early_stopping(images, gram_of(images), PAIRS, ModelOrder())
     return found, learned(gram_of(images), PAIRS), why
 
 
-def test_idiosyncrasies_of_the_given_points_are_not_learned() -> None:
+def test_early_stopping_avoids_overfitting_the_given_points() -> None:
     found, whole, why = both(drawn(30, modes=12, drift=0.03))
     other = rows(drawn(1000, modes=12, drift=0.03, seed=1))
     assert held_out_nll(found, PAIRS, other) < held_out_nll(whole, PAIRS, other) - 0.5
@@ -56,7 +56,7 @@ def test_idiosyncrasies_of_the_given_points_are_not_learned() -> None:
     [(30, 2, 1e-6), (2 * FRAMES, 12, 0.03), (MIN_JUDGED_POINTS - 1, 12, 0.03)],
     ids=["few modes are all there is", "as many points as image coordinates", "too few to deal out"],
 )
-def test_shared_structure_is_learned_to_the_end(points: int, modes: int, drift: float) -> None:
+def test_learning_runs_to_the_end_without_evidence_of_overfitting(points: int, modes: int, drift: float) -> None:
     found, whole, why = both(drawn(points, modes=modes, drift=drift))
     np.testing.assert_array_equal(found.over_frames(), whole.over_frames())
     assert "learned in" not in why
@@ -71,7 +71,7 @@ def test_a_large_sample_is_not_held_out(monkeypatch: pytest.MonkeyPatch) -> None
 def test_a_reduced_number_of_modes_is_reported() -> None:
     images = drawn(200, modes=2, drift=1e-6)
     _, why = learn_with_early_stopping(images, gram_of(images), PAIRS, ModelOrder(max_modes=4))
-    assert why.endswith("more than 4 modes, learned from some points, do not make the others more probable.")
+    assert why.endswith("more than 4 modes, learned from some points, do not make other points more probable.")
 
 
 def test_a_stop_ends_the_scoring(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,18 +17,18 @@ def metric(frames: int, *, ordered: bool) -> tuple[FrameMetric, np.ndarray]:
 
 
 @pytest.mark.parametrize("frames", [3, 24])
-def test_without_order_the_root_is_exact(frames: int) -> None:
+def test_the_root_is_exact_for_unordered_frames(frames: int) -> None:
     found, expected = metric(frames, ordered=False)
     root = found.parameters(np.eye(frames))
     np.testing.assert_allclose(root @ root.T, expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("frames", [3, 24, 200])
-def test_of_a_film_the_root_is_that_of_a_walk_whose_precision_is_diagonal_in_cosines(frames: int) -> None:
+def test_the_root_for_a_film_is_within_a_factor_of_three_spectrally(frames: int) -> None:
     found, expected = metric(frames, ordered=True)
     root = found.parameters(np.eye(frames))
     values = np.linalg.eigvals(np.linalg.solve(expected, root @ root.T)).real
-    assert values.min() > 1 / 3
+    assert values.min() > 1 / 3  # not exact: the walk's precision is taken as diagonal in cosines
     assert values.max() < 3
 
 
@@ -47,7 +47,7 @@ def scene_of_a_face() -> tuple[Scene, np.ndarray]:
     return Scene(rows @ rows.T / 200, sequence.rotations, False, 0.01, 1e-4, smoothness=0.0), np.ones(20)
 
 
-def test_twenty_steps_in_the_metric_go_further_than_a_hundred_in_the_parameters() -> None:
+def test_20_steps_in_the_metric_beat_100_steps_in_the_parameters() -> None:
     scene, scales = scene_of_a_face()
     begun = start(scene, scales)
     _, plain = fit(scene, begun, iterations=100, turning=True)
@@ -56,7 +56,7 @@ def test_twenty_steps_in_the_metric_go_further_than_a_hundred_in_the_parameters(
     assert natural == pytest.approx(energy(scene, moved)[0], rel=1e-12)
 
 
-def test_rotations_that_are_held_stay_where_they_are() -> None:
+def test_fixed_rotations_do_not_change() -> None:
     scene, scales = scene_of_a_face()
     begun = start(scene, scales)
     moved, _ = fit(scene, begun, iterations=10, turning=False, metric=metric_of(scene, begun))

@@ -37,7 +37,7 @@ def scene(gram: np.ndarray, rotations: np.ndarray, *, with_scales: bool, prior_w
 
 
 def a_scene(*, with_scales: bool, prior_weight: float = 0.01) -> tuple[Scene, Basis]:
-    """Random tracks, and a basis near nothing in particular."""
+    """Random tracks and a randomly perturbed basis."""
     random = np.random.default_rng(3)
     tracks = random.normal(size=(2 * FRAMES, 60))
     rotations = exponential(random.normal(0, 0.4, (FRAMES, 3)))
@@ -47,7 +47,7 @@ def a_scene(*, with_scales: bool, prior_weight: float = 0.01) -> tuple[Scene, Ba
 
 
 def image_of(basis: Basis, projections: np.ndarray, axis_covariance: np.ndarray, noise: float) -> np.ndarray:
-    """The covariance of the image, by way of the world's, dense."""
+    """The dense image covariance, computed from that of the world."""
     seen = np.zeros((2 * FRAMES, 3 * FRAMES))
     for frame in range(FRAMES):
         seen[2 * frame : 2 * frame + 2, 3 * frame : 3 * frame + 3] = projections[frame]
@@ -66,7 +66,7 @@ def test_the_energy_is_the_likelihood_of_the_dense_covariance() -> None:
     assert energy(place, covariance().axis_covariance, basis)[0] == pytest.approx(expected, rel=1e-10)
 
 
-def test_it_begins_as_the_shape_covariance() -> None:
+def test_the_initial_covariance_equals_the_shape_covariance() -> None:
     place, _ = a_scene(with_scales=False)
     start = covariance(noise=0.01)
     projections = place.rotations[:, :2]
@@ -75,7 +75,7 @@ def test_it_begins_as_the_shape_covariance() -> None:
 
 
 @pytest.mark.parametrize("with_scales", [True, False])
-def test_the_gradient_is_that_of_the_energy(with_scales: bool) -> None:
+def test_the_gradient_matches_finite_differences_of_the_energy(with_scales: bool) -> None:
     place, basis = a_scene(with_scales=with_scales)
     flat, gradient = basis.flat(), energy(place, covariance().axis_covariance, basis)[1].flat()
     random, step = np.random.default_rng(0), 1e-6
@@ -88,7 +88,7 @@ def test_the_gradient_is_that_of_the_energy(with_scales: bool) -> None:
         assert gradient @ way == pytest.approx((ahead - behind) / (2 * step), rel=1e-5, abs=1e-6)
 
 
-def test_it_is_used_for_many_points_few_modes_little_noise_and_short_sequences() -> None:
+def test_identifiability_needs_many_points_few_modes_low_noise_few_frames() -> None:
     quiet = covariance(noise=1e-8)
     least = POINTS_PER_COEFFICIENT * 3 * 3
     assert is_identifiable(quiet, least)
@@ -96,7 +96,7 @@ def test_it_is_used_for_many_points_few_modes_little_noise_and_short_sequences()
     assert not is_identifiable(replace(quiet, noise_variance=MAX_NOISE_STD**2), least)
     assert not is_identifiable(
         covariance(frames=5, modes=3, noise=1e-8), 10_000
-    )  # twelve coefficients, ten numbers a point
+    )  # 12 coefficients, but 10 numbers per point
     assert not is_identifiable(covariance(frames=MAX_BASIS_FRAMES + 1, noise=1e-8), 10_000)
 
 
@@ -125,7 +125,7 @@ def test_modes_along_different_axes_determine_the_cameras() -> None:
     np.testing.assert_array_equal(scales, np.ones(FRAMES))
 
 
-def test_a_stop_ends_it_after_one_step() -> None:
+def test_a_stop_ends_the_refinement_after_one_step() -> None:
     place, _ = a_scene(with_scales=False)
     asked = []
 

@@ -51,14 +51,14 @@ def test_both_forms_agree(frames: int, modes: int, drift: float) -> None:
         np.testing.assert_allclose(getattr(low_rank, name), expected, atol=1e-8 * np.abs(expected).max())
 
 
-def test_the_value_is_that_of_the_definition() -> None:
+def test_the_value_matches_the_definition() -> None:
     model, factor = drawn(9, 2)
     image = model.covariance()
     expected = (np.linalg.slogdet(image)[1] + np.trace(np.linalg.solve(image, factor @ factor.T))) / len(image)
     assert woodbury_terms(model, factor).value == pytest.approx(expected, rel=1e-12)
 
 
-def test_the_gradient_is_that_of_the_value() -> None:
+def test_the_gradient_matches_finite_differences_of_the_value() -> None:
     model, factor = drawn(9, 2)
     found, step = woodbury_terms(model, factor), 1e-6
     random = np.random.default_rng(0)
@@ -77,7 +77,7 @@ def test_the_gradient_is_that_of_the_value() -> None:
     assert slope == pytest.approx(expected, rel=1e-6)
 
 
-def test_hardly_any_noise_costs_no_digits() -> None:
+def test_very_low_noise_does_not_lose_precision() -> None:
     model, factor = drawn(20, 3, noise=1e-4, drift=1e-6)
     image = model.covariance().astype(np.longdouble)
     rough = np.linalg.solve(image.astype(float), factor)
@@ -86,21 +86,21 @@ def test_hardly_any_noise_costs_no_digits() -> None:
     assert woodbury_terms(model, factor).value == pytest.approx(expected, rel=1e-10)
 
 
-def test_the_faster_form_is_taken_and_gives_the_same() -> None:
+def test_terms_use_woodbury_for_long_and_dense_for_short_sequences() -> None:
     model, factor = drawn(100, 3)
     np.testing.assert_allclose(terms(model, factor).by_columns, woodbury_terms(model, factor).by_columns, atol=1e-12)
     model, factor = drawn(20, 3)
     np.testing.assert_array_equal(terms(model, factor).by_columns, dense_terms(model, factor).by_columns)
 
 
-def test_the_factor_has_as_many_columns_as_there_are_points() -> None:
+def test_a_gram_factor_has_about_one_column_per_point() -> None:
     _, factor = drawn(40, 3, points=11)
     found = factor_of(factor @ factor.T)
     assert 11 <= found.shape[1] <= 13
     np.testing.assert_allclose(found @ found.T, factor @ factor.T, atol=1e-13)
 
 
-def test_the_walk_is_that_of_its_dense_precision() -> None:
+def test_the_walk_posterior_matches_its_dense_precision() -> None:
     frames = 19
     model, _ = drawn(frames, 0)
     images = np.zeros((2 * frames, 3 * frames))
@@ -116,7 +116,7 @@ def test_the_walk_is_that_of_its_dense_precision() -> None:
 
 
 @pytest.mark.parametrize("form", [terms, woodbury_terms])
-def test_what_is_not_finite_is_refused(form: object) -> None:
+def test_non_finite_or_indefinite_input_raises(form: object) -> None:
     model, factor = drawn(6, 1)
     with pytest.raises(np.linalg.LinAlgError), np.errstate(all="ignore"):
         form(replace(model, walk=np.full_like(model.walk, np.inf)), factor)  # type: ignore[operator]
@@ -127,7 +127,7 @@ def test_what_is_not_finite_is_refused(form: object) -> None:
 
 
 @pytest.mark.parametrize("frames", [9, 100])
-def test_each_point_has_the_density_of_the_definition(frames: int) -> None:
+def test_the_nll_of_each_point_matches_the_definition(frames: int) -> None:
     model, factor = drawn(frames, 2)
     image = model.covariance()
     expected = np.linalg.slogdet(image)[1] + (factor * np.linalg.solve(image, factor)).sum(axis=0)

@@ -107,7 +107,7 @@ def test_the_noise_is_raised_to_its_floor() -> None:
 
 
 @pytest.mark.parametrize("share", [0.02, 0.1])
-def test_outliers_are_found_and_counted_whatever_was_expected(share: float) -> None:
+def test_outliers_and_their_share_are_found_from_a_wrong_initial_share(share: float) -> None:
     covariance, points = paths()
     random = np.random.default_rng(3)
     wrong = random.random((FRAMES, POINTS)) < share
@@ -121,7 +121,7 @@ def test_outliers_are_found_and_counted_whatever_was_expected(share: float) -> N
     assert (weight[~wrong] < 0.5).mean() < 0.03
 
 
-def test_hidden_observations_have_no_part() -> None:
+def test_hidden_observations_do_not_affect_the_outlier_share() -> None:
     covariance, points = paths()
     hidden = np.zeros((FRAMES, POINTS))
     probability, share = inlier_probabilities(covariance, NOISE, 0 * points, hidden, hidden, share=0.1)
@@ -132,7 +132,7 @@ def test_hidden_observations_have_no_part() -> None:
     assert clean.min() > 0.5
 
 
-def test_overrated_predictions_do_not_make_outliers_of_all() -> None:
+def test_an_overconfident_covariance_does_not_reject_all_observations() -> None:
     covariance, points = paths()
     ones = np.ones((FRAMES, POINTS))
     tight = covariance / 400

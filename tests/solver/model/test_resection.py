@@ -62,7 +62,7 @@ def test_given_cameras_are_kept(shapes: MeanShapes, truth: Poses) -> None:
     assert found.coefficients == pytest.approx(truth.coefficients, abs=1e-4)
 
 
-def test_after_a_stop_frames_stay_at_their_start(shapes: MeanShapes, truth: Poses) -> None:
+def test_a_stop_keeps_the_starting_rotations(shapes: MeanShapes, truth: Poses) -> None:
     _, image, _ = predicted(shapes, truth, 0.0)
     found = resected(
         Views(image, np.ones((FRAMES, POINTS))), shapes, start(), turning=True, with_scales=True,
@@ -85,6 +85,6 @@ def test_poses_are_interpolated_and_constant_beyond_the_frames_used(truth: Poses
 
 
 @pytest.mark.parametrize("ordered", [True, False])
-def test_the_walk_of_some_frames_is_that_of_all(ordered: bool) -> None:
+def test_the_walk_at_some_frames_is_a_submatrix_of_the_full_walk(ordered: bool) -> None:
     used = np.array([0, 3, 4, 20])
     assert random_walk_at(used, 21, ordered) == pytest.approx(random_walk(21, ordered)[np.ix_(used, used)], abs=1e-12)

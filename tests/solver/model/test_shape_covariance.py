@@ -49,7 +49,7 @@ def drawn(points: int = 4000, noise: float = 1e-4) -> tuple[ShapeCovariance, np.
     return truth, projections, rows @ rows.T / points
 
 
-def test_no_round_makes_the_tracks_less_probable() -> None:
+def test_no_em_iteration_increases_the_nll() -> None:
     _, projections, gram = drawn(300)
     covariance = begin(gram, projections)
     likelihoods = []
@@ -147,7 +147,7 @@ def error(face: gallery.Sequence, *, known: bool, settings: Settings, spoiled: g
 
 @pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.long)])
 @pytest.mark.slow
-def test_it_reduces_the_error_of_a_face(face: gallery.Sequence, known: bool) -> None:
+def test_the_gaussian_prior_reduces_the_error_of_a_face(face: gallery.Sequence, known: bool) -> None:
     smooth = error(face, known=known, settings=Settings(prior="smooth"))
     gaussian = error(face, known=known, settings=Settings())
     assert 1e-4 < gaussian < 0.6 * smooth

@@ -33,7 +33,7 @@ def operator(mesh: Mesh) -> Operator:
     return operator_at(problem, init(problem, shapes, np.zeros((3, 2))))
 
 
-def test_levels_shrink_quickly_and_keep_what_is_constant() -> None:
+def test_levels_shrink_quickly_and_represent_constants() -> None:
     levels, constant = laplacian().levels, np.ones(ROWS * COLUMNS)
     sizes = [ROWS * COLUMNS, *(len(level.bending) for level in levels)]
     assert len(levels) >= 2
@@ -44,11 +44,11 @@ def test_levels_shrink_quickly_and_keep_what_is_constant() -> None:
         np.testing.assert_array_equal(level.down.toarray(), level.up.toarray().T)
         np.testing.assert_allclose(level.mean.sum(axis=1), 1)
         coarse = np.linalg.lstsq(level.up.toarray(), constant, rcond=None)[0]
-        np.testing.assert_allclose(level.up @ coarse, constant, atol=1e-9)  # or what bends not at all would bend
+        np.testing.assert_allclose(level.up @ coarse, constant, atol=1e-9)  # otherwise a constant would bend
         constant = coarse
 
 
-def test_columns_are_of_unit_length_and_bending_is_theirs() -> None:
+def test_columns_have_unit_length_and_match_the_stored_bending() -> None:
     built = laplacian()
     whole = np.eye(ROWS * COLUMNS)
     for level in built.levels:
@@ -57,7 +57,7 @@ def test_columns_are_of_unit_length_and_bending_is_theirs() -> None:
         np.testing.assert_allclose(level.bending, ((built.matrix.toarray() @ whole) ** 2).sum(axis=0), rtol=1e-9)
 
 
-def test_points_without_neighbours_end_the_levels() -> None:
+def test_points_without_neighbours_do_not_stall_coarsening() -> None:
     lonely = Mesh.from_faces(np.array([[0, 1, 2]]), 40)
     levels = build_levels(laplacian(lonely).matrix)
     assert all(len(level.bending) < level.up.shape[0] for level in levels)
@@ -68,7 +68,7 @@ def test_rounding_rounds_the_levels() -> None:
     assert {matrix.dtype for level in levels for matrix in (level.up, level.down, level.mean)} == {np.dtype(np.float32)}
 
 
-def test_the_sum_is_symmetric_and_positive() -> None:
+def test_the_multilevel_preconditioner_is_symmetric_positive_definite() -> None:
     inverse, given = build_preconditioner(operator(triangulated(sheet()[1]))), operator(triangulated(sheet()[1]))
     assert bends(given)
     shape = (3, 3, given.weights.shape[2])
@@ -79,8 +79,8 @@ def test_the_sum_is_symmetric_and_positive() -> None:
 
 
 @pytest.mark.parametrize(("kind", "times"), [("grid", 1.2), ("triangles", 1.5)])
-def test_the_paper_s_weights_cost_few_iterations(kind: str, times: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What they are for: without levels the count grows with the width of the surface."""
+def test_levels_cut_iterations_with_paper_weights(kind: str, times: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without levels the iterations grow with the width of the surface."""
     made = gallery.corrupt(gallery.face(5, 3000, mesh=kind), outliers=0.1)  # type: ignore[arg-type]
     cameras = KnownCamera.from_arrays(made.rotations, made.scales)
     settings = Settings(prior="smooth", preset="paper", max_reweightings=4)
@@ -93,7 +93,7 @@ def test_the_paper_s_weights_cost_few_iterations(kind: str, times: float, monkey
     assert 4 < times * with_levels < iterations()
 
 
-def test_little_bending_beside_stiff_paths_needs_no_levels() -> None:
+def test_negligible_bending_needs_no_levels() -> None:
     given = operator(triangulated(sheet()[1]))
     assert not bends(replace(given, spatial_weight=1e-9))
     assert not bends(replace(given, spatial_weight=0.0))

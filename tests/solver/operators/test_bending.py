@@ -27,7 +27,7 @@ def test_rows_multiplied_together_equal_single_products(kind: type, tile: int, m
     np.testing.assert_allclose(out, 1 + 0.5 * rows @ exact.T @ exact, atol=10 * close)
 
 
-def test_rounding_to_the_precision_there_is_changes_nothing() -> None:
+def test_rounding_to_the_current_precision_changes_nothing() -> None:
     laplacian = build_laplacian(triangulated(sheet()[1]), "uniform")
     assert laplacian is not None
     assert laplacian.rounded(np.dtype(np.float64)) is laplacian

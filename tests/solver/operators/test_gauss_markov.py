@@ -20,7 +20,7 @@ FRAMES, POINTS = 14, 23
 
 
 def roots() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A mean of its own for each coordinate, and three waves."""
+    """A separate mean for each coordinate, and three waves."""
     time = np.linspace(0, 1, FRAMES)
     waves = 0.3 * np.stack([np.sin(5 * time), np.cos(7 * time), time], axis=1)
     first, second, third = (np.column_stack([waves, np.full(FRAMES, mean)]) for mean in (0.2, 1.0, 0.0))
@@ -43,7 +43,7 @@ def a_frame_s(weight: float) -> np.ndarray:
     return np.ascontiguousarray(np.broadcast_to(each, (FRAMES, 2, POINTS)))
 
 
-def test_it_is_the_inverse_of_the_covariance() -> None:
+def test_the_path_prior_is_the_inverse_of_the_covariance() -> None:
     bands, norm = walk_bands(FRAMES)
     chain = np.diag(bands[0]) + np.diag(bands[1, :-1], 1) + np.diag(bands[1, :-1], -1)
     for found, root in zip(prior().matrices(), roots(), strict=True):
@@ -51,7 +51,7 @@ def test_it_is_the_inverse_of_the_covariance() -> None:
         np.testing.assert_allclose(found @ covariance, np.eye(FRAMES), atol=1e-9)
 
 
-def test_stencil_and_modes_make_the_product_and_the_value() -> None:
+def test_product_and_value_match_the_dense_precision() -> None:
     given, shapes = (
         operator(np.zeros((FRAMES, 2, POINTS))),
         np.random.default_rng(0).standard_normal((FRAMES, 3, POINTS)),
@@ -62,7 +62,7 @@ def test_stencil_and_modes_make_the_product_and_the_value() -> None:
     assert given.quadratic.value(shapes) == pytest.approx(float((product * shapes).sum()), rel=1e-12)
 
 
-def test_directions_of_least_precision_have_the_largest_variance() -> None:
+def test_the_loosest_directions_have_the_smallest_eigenvalues() -> None:
     found = prior().loosest(2)
     for (directions, held), matrix in zip(found, prior().matrices(), strict=True):
         values, vectors = np.linalg.eigh(matrix)
@@ -70,7 +70,7 @@ def test_directions_of_least_precision_have_the_largest_variance() -> None:
         np.testing.assert_allclose(np.abs(directions.T @ vectors[:, :2]), np.eye(2), atol=1e-2)
 
 
-def test_one_weight_a_frame_and_it_is_inverted_exactly() -> None:
+def test_one_weight_per_frame_is_inverted_exactly() -> None:
     given = operator(a_frame_s(300.0))
     assert build_coarse(given, np.zeros(POINTS)) is None
     shapes = np.random.default_rng(2).standard_normal((FRAMES, 3, POINTS))
@@ -78,7 +78,7 @@ def test_one_weight_a_frame_and_it_is_inverted_exactly() -> None:
     np.testing.assert_allclose(build_preconditioner(given)(given.apply(shapes)), shapes, atol=0.02)
 
 
-def test_it_stays_symmetric_and_positive_where_whole_frames_are_hidden() -> None:
+def test_preconditioner_is_symmetric_positive_definite_with_hidden_frames() -> None:
     weights = a_frame_s(300.0)
     weights[3:6] = 0
     precondition = build_preconditioner(operator(weights))
@@ -89,7 +89,7 @@ def test_it_stays_symmetric_and_positive_where_whole_frames_are_hidden() -> None
     assert np.linalg.eigvalsh(matrix).min() > 0
 
 
-def test_single_precision_keeps_the_preconditioner() -> None:
+def test_single_precision_barely_changes_the_preconditioner() -> None:
     given, r = operator(a_frame_s(300.0)), np.random.default_rng(3).standard_normal((FRAMES, 3, POINTS))
     double, single = (build_preconditioner(each)(r.astype(kind)) for each, kind in both(given))
     assert single.dtype == np.float32
@@ -100,7 +100,7 @@ def both(given: Operator) -> list[tuple[Operator, type]]:
     return [(given, np.float64), (given.rounded(np.dtype(np.float32)), np.float32)]
 
 
-def test_blocks_of_points_are_the_same_for_all_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gauss_markov, "POINT_BLOCK", 4)
     monkeypatch.setattr(gauss_markov, "SMALLEST", 1)
     given, r = operator(a_frame_s(300.0)), np.random.default_rng(4).standard_normal((FRAMES, 3, POINTS))
@@ -115,7 +115,7 @@ def test_blocks_of_points_are_the_same_for_all_threads(monkeypatch: pytest.Monke
     assert found[0][2] == found[1][2]
 
 
-def test_a_prior_of_weight_zero_is_not_preconditioned() -> None:
+def test_the_preconditioner_is_finite_with_a_prior_of_weight_zero() -> None:
     given = operator(a_frame_s(300.0))
     nothing = replace(given, quadratic=prior().scaled(0.0))
     shapes = np.random.default_rng(5).standard_normal((FRAMES, 3, POINTS))

@@ -17,7 +17,7 @@ FRAMES = 24
 
 
 def found(degrees: float, depth: float) -> tuple[np.ndarray, Learned]:
-    """Tracks' Gram matrix and the cameras and covariance that it has, for an object with extents 1, 1 and `depth`."""
+    """The Gram matrix, cameras and covariance of an object with extents 1, 1 and `depth`."""
     time = np.linspace(0, 2 * np.pi, FRAMES)
     tilts = np.radians(degrees / 2) * np.stack([np.sin(time), np.cos(2 * time), 0 * time], axis=1)
     rolls = exponential(np.stack([0 * time, 0 * time, 0.4 * np.sin(time)], axis=1))
@@ -53,7 +53,7 @@ def test_rotations_are_rolls_after_tilts() -> None:
     np.testing.assert_allclose(tilts @ toward, 0, atol=1e-12)
 
 
-def test_images_change_in_the_second_order_of_the_angles_only() -> None:
+def test_images_change_only_to_second_order_in_the_angles() -> None:
     def change(degrees: float) -> float:
         gram, given = found(degrees, 0.5)
         moved = bas_relief._stretched(given, 0.5, *bas_relief._decomposed(given.rotations))
@@ -67,7 +67,7 @@ def test_images_change_in_the_second_order_of_the_angles_only() -> None:
     np.testing.assert_allclose(same.covariance.of_image(same.rotations[:, :2]), gram, atol=1e-12)
 
 
-def test_depth_is_the_expected_one_without_rotation_and_the_tracks_own_with_it() -> None:
+def test_depth_follows_the_tracks_only_with_enough_rotation() -> None:
     gram, deep = found(1, 4.0)
     settled, stretch = settled_depth(gram, deep)
     assert settled.covariance.mean_covariance[2, 2] ** 0.5 == pytest.approx(4.0 * stretch)
@@ -76,13 +76,13 @@ def test_depth_is_the_expected_one_without_rotation_and_the_tracks_own_with_it()
     assert settled_depth(gram, turning)[1] == pytest.approx(1, abs=0.01)
 
 
-def test_without_a_weight_the_tracks_own_depth_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_zero_prior_weight_keeps_the_depth_of_the_tracks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bas_relief, "CAMERA_PRIOR_WEIGHT", 0.0)
     gram, given = found(10, 1.5)
     assert settled_depth(gram, given)[1] == pytest.approx(1, abs=0.01)
 
 
-def test_views_from_all_around_are_left_alone() -> None:
+def test_cameras_from_all_around_are_unchanged() -> None:
     rotations = Rotation.from_euler("y", np.linspace(0, 350, FRAMES)[:, None], degrees=True).as_matrix()
     gram, given = found(10, 1.5)
     around = Learned(rotations, given.scales, given.covariance, 0.0)
@@ -98,7 +98,7 @@ def depth_of(shapes: np.ndarray, rotations: np.ndarray) -> float:
 
 
 @pytest.mark.slow
-def test_a_head_that_turns_by_2_degrees_is_as_deep_as_a_head() -> None:
+def test_a_head_that_turns_by_2_degrees_gets_a_plausible_depth() -> None:
     head = gallery.face(14, 100, degrees=1, tilt=0.5)
     tracks, _ = gallery.corrupt_tracks(head.tracks, noise=0.003, seed=0)
     solution = solve(tracks, head.mesh)
@@ -146,7 +146,7 @@ def test_a_hill_bulges_and_a_bowl_does_not(y_up: bool) -> None:
     ],
 )
 def test_a_face_has_its_nose_in_front(y_up: bool, hidden: tuple[int, ...]) -> None:
-    """The first cameras of this one are inside out. Those of frames that show too little are between their neighbours'."""
+    """The first cameras of this face are inside out; those of sparsely observed frames lie between their neighbours."""
     head = gallery.face(14, 60, degrees=30, seed=1)
     visible = head.tracks.visible.copy()
     visible[list(hidden), 2:] = 0

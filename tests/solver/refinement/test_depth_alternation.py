@@ -20,7 +20,7 @@ PICTURE = (1280.0, 720.0)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_cameras_get_the_world_axes_and_the_sign_of_depth_of_others(mirrored: bool) -> None:
+def test_aligned_cameras_adopt_the_world_axes_and_depth_sign_of_others(mirrored: bool) -> None:
     random = np.random.default_rng(0)
     rotations = exponential(random.normal(0, 0.6, (9, 3)))
     moved = rotations @ exponential(random.normal(size=(1, 3)))[0]
@@ -45,7 +45,7 @@ def rigid() -> tuple[np.ndarray, Perspective, np.ndarray]:
 
 
 @pytest.mark.parametrize("degrees", [0.0, 6.0])
-def test_a_factorization_replaces_cameras_that_are_off_and_no_others(
+def test_a_new_factorization_corrects_cameras_that_are_off(
     rigid: tuple[np.ndarray, Perspective, np.ndarray], degrees: float
 ) -> None:
     rotations, view, gram = rigid
@@ -60,7 +60,7 @@ def test_a_factorization_replaces_cameras_that_are_off_and_no_others(
     assert factorized_again(gram, moved, found, used, model_order=ModelOrder(), should_stop=lambda: True) is None
 
 
-def test_a_round_that_leads_to_depths_beyond_any_measure_is_not_taken(
+def test_a_round_that_leads_to_extreme_depths_is_discarded(
     rigid: tuple[np.ndarray, Perspective, np.ndarray],
 ) -> None:
     rotations, view, gram = rigid

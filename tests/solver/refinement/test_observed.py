@@ -38,7 +38,7 @@ def true_sample(unit: float) -> Floats:
 
 
 def test_a_point_is_judged_by_a_covariance_of_the_others() -> None:
-    """One point that jumps about fills modes of its own, if it is learned from; the others do not predict it."""
+    """A point that jumps about would get its own modes if it were learned from; the others do not predict it."""
     points = np.array(MADE.tracks.points)
     random = np.random.default_rng(0)
     wild = random.random(20) < 0.6
@@ -103,7 +103,7 @@ def test_a_stop_leaves_the_cameras() -> None:
 
 @pytest.mark.parametrize("turning", [True, False])
 def test_cameras_are_refined_on_the_observations_where_entries_are_hidden(turning: bool) -> None:
-    """The completed tracks of noisy points allow few modes; the moments, which state what they do not know, all."""
+    """Completed tracks of noisy points support few modes; the moments, which include their uncertainty, support all."""
     tracks = gallery.corrupt(MADE, noise=0.01, hidden=0.3, seed=2).tracks
     normalized = normalize(tracks)
     estimate = given_cameras(normalized, KNOWN, Settings())
@@ -115,7 +115,7 @@ def test_cameras_are_refined_on_the_observations_where_entries_are_hidden(turnin
     assert np.array_equal(found.rotations, estimate.rotations) != turning
 
 
-def test_where_too_little_would_be_left_nothing_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_outliers_are_kept_if_too_few_points_would_remain(monkeypatch: pytest.MonkeyPatch) -> None:
     tracks = gallery.corrupt(MADE, outliers=0.1, seed=1).tracks
     nothing = np.zeros(tracks.visible.shape)
     monkeypatch.setattr(reconstruction, "cross_fitted", lambda *_, **__: (nothing, 0.5))
@@ -125,7 +125,7 @@ def test_where_too_little_would_be_left_nothing_is_left_out(monkeypatch: pytest.
 
 
 @pytest.mark.slow
-def test_outliers_have_no_part_in_the_unit_of_the_tracks() -> None:
+def test_outliers_do_not_affect_the_unit_of_the_tracks() -> None:
     points, random = np.array(MADE.tracks.points), np.random.default_rng(1)
     wrong = random.random(points.shape[:2]) < 0.1
     points[wrong] += random.uniform(-400, 400, (wrong.sum(), 2))

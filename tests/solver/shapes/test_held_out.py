@@ -1,4 +1,4 @@
-"""Held-out observations: the closed form is a refit without them, and what the figure separates."""
+"""Held-out error: its closed form equals a refit, and it separates correct models from wrong ones."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_the_closed_form_is_a_refit_without_the_observations() -> None:
 
 @pytest.mark.parametrize("focal", [None, 8.0])
 @pytest.mark.parametrize("unit", [1.0, 250.0])
-def test_a_right_model_predicts_to_its_noise_and_a_wrong_one_does_not(focal: float | None, unit: float) -> None:
+def test_only_a_correct_model_predicts_down_to_the_noise(focal: float | None, unit: float) -> None:
     tracks, shapes, camera, covariance = a_film(focal=focal)
     scaled = replace(camera, translations=unit * camera.translations, focal=None if focal is None else unit * focal)
     seen = np.ones((FRAMES, POINTS))
@@ -84,7 +84,7 @@ def test_the_order_of_the_points_does_not_matter() -> None:
     assert held_out_error(moved, shapes[:, order], camera, seen, covariance, unit=1.0) == pytest.approx(found)
 
 
-def test_nothing_is_stated_where_nothing_can_be_held_out() -> None:
+def test_no_error_is_reported_if_nothing_can_be_held_out() -> None:
     tracks, shapes, camera, covariance = a_film()
     rarely = np.zeros((FRAMES, POINTS))
     rarely[:2] = 1

@@ -15,7 +15,7 @@ EXTENT = np.array([40.0, 30.0])
 
 
 @pytest.mark.parametrize("loss", ["l1", "l2", "huber"])
-def test_it_is_bayes_rule(loss: str) -> None:
+def test_inlier_probability_follows_bayes_rule(loss: str) -> None:
     found = inlier_probability(LEFT, SEEN, NONE, noise_std=2.0, extent=EXTENT, loss=loss)
     share, area = 1 / 302, 42.0 * 32.0
     if loss == "l1":
@@ -26,7 +26,7 @@ def test_it_is_bayes_rule(loss: str) -> None:
 
 
 @pytest.mark.parametrize("loss", ["l1", "l2"])
-def test_the_unit_does_not_matter_and_longer_residuals_are_less_probable(loss: str) -> None:
+def test_probability_is_unit_free_and_decreases_with_the_residual(loss: str) -> None:
     one = inlier_probability(LEFT, SEEN, NONE, noise_std=2.0, extent=EXTENT, loss=loss)
     scaled = inlier_probability(1e3 * LEFT, SEEN, NONE, noise_std=2e3, extent=1e3 * EXTENT, loss=loss)
     np.testing.assert_allclose(one, scaled, rtol=1e-9)
@@ -34,7 +34,7 @@ def test_the_unit_does_not_matter_and_longer_residuals_are_less_probable(loss: s
     assert (longer < inlier_probability(LEFT, SEEN, NONE, noise_std=9.0, extent=EXTENT, loss=loss)).all()
 
 
-def test_confidence_is_that_of_a_larger_noise() -> None:
+def test_lower_confidence_acts_as_larger_noise() -> None:
     """With the loss `l2` an observation of confidence v has the noise variance σ²/v."""
     half = inlier_probability(LEFT, 0.5 * SEEN, NONE, noise_std=3.0, extent=1e9 * EXTENT, loss="l2")
     wide = inlier_probability(LEFT, SEEN, NONE, noise_std=3.0 * 2**0.5, extent=1e9 * EXTENT, loss="l2")

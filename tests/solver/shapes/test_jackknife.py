@@ -1,4 +1,4 @@
-"""How far shapes depend on which points were learned from: what changes it, and what must not."""
+"""Jackknife: how much shapes depend on the points that were learned from."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FRAMES = 12
 
 
 def seen(points: int, *, degrees: float = 50.0, seed: int = 0) -> tuple[CameraEstimate, ShapeCovariance, np.ndarray]:
-    """A body of a mean and two modes before a camera that turns, its learned covariance, and its true shapes."""
+    """A mean shape with two modes seen by a turning camera: estimate, learned covariance and true shapes."""
     rng = np.random.default_rng(seed)
     modes = np.stack([np.sin(np.arange(FRAMES) / 2), np.cos(np.arange(FRAMES) / 3)])
     shapes = rng.normal(size=(points, 3)) + 0.3 * np.einsum("kf,kpi->fpi", modes, rng.normal(size=(2, points, 3)))
@@ -59,7 +59,7 @@ def test_a_camera_that_hardly_turns_is_less_certain() -> None:
     assert wide < 0.5 * narrow
 
 
-def test_it_does_not_depend_on_the_unit_of_the_scales_nor_on_the_world_axes() -> None:
+def test_learning_std_does_not_depend_on_the_world_axes() -> None:
     estimate, covariance, shapes = seen(30)
     plain = learning_std(estimate, covariance, shapes, turning=False)
     turn = Rotation.from_euler("xyz", (30, -20, 50), degrees=True).as_matrix()
@@ -74,7 +74,7 @@ def test_it_does_not_depend_on_the_unit_of_the_scales_nor_on_the_world_axes() ->
     )
 
 
-def test_more_frames_than_are_evaluated_are_interpolated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_learning_std_is_interpolated_between_evaluated_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     estimate, covariance, shapes = seen(30)
     whole = learning_std(estimate, covariance, shapes, turning=False)
     monkeypatch.setattr("pliant.solver.shapes.jackknife.MAX_JACKKNIFE_FRAMES", 8)
@@ -83,14 +83,14 @@ def test_more_frames_than_are_evaluated_are_interpolated(monkeypatch: pytest.Mon
     assert 0.3 < rms(some) / rms(whole) < 3
 
 
-def test_hardly_any_points_or_a_request_to_stop_give_zero() -> None:
+def test_too_few_points_or_a_stop_give_zero() -> None:
     estimate, covariance, shapes = seen(20)
     few = replace(estimate, sample=estimate.sample[:, :MIN_LEARNED_POINTS])
     assert (learning_std(few, covariance, shapes, turning=True) == 0).all()
     assert (learning_std(estimate, covariance, shapes, turning=True, should_stop=lambda: True) == 0).all()
 
 
-def test_a_depth_without_bounds_makes_every_position_as_uncertain_as_the_object_is_large() -> None:
+def test_unbounded_depth_caps_the_std_at_the_distance_from_the_centroid() -> None:
     estimate, covariance, shapes = seen(20)
     unbounded = replace(covariance, mean_covariance=np.full((3, 3), 1e30))
     found = learning_std(estimate, unbounded, shapes, turning=False)

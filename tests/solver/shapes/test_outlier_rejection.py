@@ -95,7 +95,7 @@ def test_a_stop_before_the_shapes_rejects_nothing() -> None:
 
 
 def test_long_films_are_judged_in_windows_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Far frames hardly change a prediction, so windows find what the whole film finds."""
+    """Distant frames hardly change a prediction, so windows suffice for long films."""
     cameras = estimate_cameras(OUTLIER_SHARE, CAMERAS, settings=Settings(order="film"))
     prior = learn_prior(OUTLIER_SHARE, cameras)
     whole = find_outliers(OUTLIER_SHARE, cameras, prior)

@@ -29,7 +29,7 @@ CAMERAS = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
 
 
 def seen_but(points: list[int], *, shown: tuple[int, ...] = ()) -> Tracks:
-    """All is visible, but these points in the frames `shown` alone."""
+    """All points are visible, except `points`, which are seen only in the frames `shown`."""
     visible = np.ones(MADE.tracks.points.shape[:2])
     visible[np.ix_(np.setdiff1d(np.arange(16), shown), points)] = 0
     return Tracks.from_arrays(MADE.tracks.points, visible)
@@ -68,7 +68,7 @@ def test_a_hole_in_the_face_is_closed(cameras: KnownCamera | None) -> None:
 
 
 def test_sparsely_observed_points_match_their_observations() -> None:
-    """Seen in three frames of 16, the patch passes through what was seen there, and is nearer to the truth than drawn alone."""
+    """Seen in 3 of 16 frames, the patch passes through its observations and is closer to the truth than an unseen one."""
     drawn, seldom = (
         solve(seen_but(HOLE), MADE.mesh, cameras=CAMERAS),
         solve(seen_but(HOLE, shown=SHOWN), MADE.mesh, cameras=CAMERAS),
@@ -86,7 +86,7 @@ def test_sparsely_observed_points_match_their_observations() -> None:
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])])
 def test_two_noisy_observations_from_one_side_keep_the_depth_bounded(seed: int) -> None:
-    """They hardly tell how deep it is; of points that may be anywhere in the body the error would be three times that of no look."""
+    """They hardly determine depth: if points could be anywhere in the body, the error would be three times that without them."""
     noise = np.random.default_rng(seed).normal(size=MADE.tracks.points.shape) * 0.02 * np.abs(TRUE).max()
     errors = []
     for shown in ((), (0, 1)):
@@ -98,7 +98,7 @@ def test_two_noisy_observations_from_one_side_keep_the_depth_bounded(seed: int) 
 
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_constant_mode_equals_a_larger_mean_position_covariance(seed: int) -> None:
-    """Where the cameras are estimated too, learning leaves to the modes what belongs to the mean positions, or the other way round."""
+    """With estimated cameras, learning may attribute the variance of mean positions to the modes, or vice versa."""
     random = np.random.default_rng(seed)
     frames, share = int(random.integers(3, 12)), random.uniform(0.2, 2)
     root, modes = random.normal(size=(3, 3)), random.normal(size=(frames, 2))
@@ -137,7 +137,7 @@ def test_outliers_of_sparsely_observed_points_cost_little_more_than_hiding_them(
 
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_worst_observation_is_rejected_first(seed: int) -> None:
-    """Against leaving out one after the other by hand, from the conditional mean and covariance of a Gaussian."""
+    """Compared with removing one at a time by the conditional mean and covariance of a Gaussian."""
     random = np.random.default_rng(seed)
     frames = 6
     root = random.normal(size=(2 * frames, 2 * frames))
@@ -180,7 +180,7 @@ def test_unconnected_points_stay_at_the_centre() -> None:
     assert np.linalg.norm(found.shapes[:, alone], axis=1).max() < 0.2 * size
 
 
-def test_a_grid_keeps_its_cells_and_gets_a_hole() -> None:
+def test_hidden_grid_points_become_a_hole_and_are_filled_in() -> None:
     made = gallery.face(12, 400, degrees=60)
     assert made.mesh.grid is not None
     hole = made.mesh.grid[8:10, 8:10].ravel()
@@ -209,7 +209,7 @@ def test_a_grid_keeps_its_cells_and_gets_a_hole() -> None:
     ],
     ids=["all seen", "no mesh", "no faces", "most are seldom seen", "seen just often enough"],
 )
-def test_all_points_are_fitted_together(tracks: Tracks, mesh: Mesh | None) -> None:
+def test_all_points_are_fitted_together_if_no_split_applies(tracks: Tracks, mesh: Mesh | None) -> None:
     assert well_observed(normalize(tracks), mesh) is None
 
 
@@ -225,6 +225,6 @@ def test_closing_the_surface_minimises_its_energy_and_keeps_known_points() -> No
 
 
 @pytest.mark.parametrize("settings", [{"prior": "smooth"}, {"temporal_weight": 0.0}], ids=str)
-def test_the_published_prior_and_one_of_no_weight_find_every_point_by_their_energy(settings: dict[str, object]) -> None:
+def test_smooth_prior_and_zero_weight_do_not_split_off_sparse_points(settings: dict[str, object]) -> None:
     found = solve(seen_but(HOLE), MADE.mesh, cameras=CAMERAS, settings=Settings(**settings))  # type: ignore[arg-type]
     assert "sparsely_observed" not in found.choices.reasons

@@ -43,7 +43,7 @@ def projection_matrix(pairs: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def test_it_is_the_inverse_of_the_posterior_precision() -> None:
+def test_position_std_comes_from_the_inverse_posterior_precision() -> None:
     given, pairs = covariance(), projections()
     rng = np.random.default_rng(1)
     confidence = rng.choice([0.0, 0.5, 1.0], size=(FRAMES, 6))
@@ -68,7 +68,7 @@ def seen_by_a_pinhole(*, y_up: bool, frames: int = FRAMES, points: int = 5) -> t
 
 
 @pytest.mark.parametrize("y_up", [False, True])
-def test_under_perspective_it_is_that_of_the_derivative_of_the_projection(y_up: bool) -> None:
+def test_position_std_under_perspective_uses_the_projection_derivative(y_up: bool) -> None:
     camera, shapes = seen_by_a_pinhole(y_up=y_up)
     unit, given = 80.0, covariance()
     pairs = camera.scales[:, None, None] * camera.rotations[:, :2]
@@ -129,7 +129,7 @@ def test_equal_visibility_gives_equal_deviation_and_hiding_or_noise_increases_it
     assert (position_std(given, pairs, np.ones((FRAMES, 3)), noise_std=3 * NOISE) > clear).all()
 
 
-def test_never_seen_is_the_prior_and_less_turn_is_less_certain() -> None:
+def test_unseen_points_have_the_prior_std_and_less_rotation_increases_it() -> None:
     given = covariance()
     never = position_std(given, projections(), np.zeros((FRAMES, 1)), noise_std=NOISE)[:, 0]
     np.testing.assert_allclose(never**2, np.diag(dense(given)).reshape(FRAMES, 3).sum(axis=1))
@@ -138,7 +138,7 @@ def test_never_seen_is_the_prior_and_less_turn_is_less_certain() -> None:
     assert (narrow > wide).all()
 
 
-def test_what_is_predicted_from_a_sample_is_near_what_is_exact(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_std_predicted_from_sampled_patterns_is_close_to_exact(monkeypatch: pytest.MonkeyPatch) -> None:
     frames, points = 24, 150
     given, pairs = covariance(3, frames), projections(frames)
     rng = np.random.default_rng(4)
@@ -153,7 +153,7 @@ def test_what_is_predicted_from_a_sample_is_near_what_is_exact(monkeypatch: pyte
     assert np.median(np.abs(np.log(predicted / exact))) < 0.2
 
 
-def test_long_films_are_evaluated_at_some_of_their_frames_and_never_too_confidently(
+def test_evaluating_some_frames_of_a_long_film_rarely_understates_the_std(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     frames = 30
@@ -165,7 +165,7 @@ def test_long_films_are_evaluated_at_some_of_their_frames_and_never_too_confiden
     assert (fewer > 0.99 * exact).mean() > 0.95
 
 
-def test_a_sparsely_observed_point_is_no_less_certain_than_its_distance_from_the_surface() -> None:
+def test_std_of_sparse_points_is_bounded_by_their_distance_from_the_surface() -> None:
     shapes = np.zeros((4, 3, 3))
     shapes[:, 1, 0], shapes[:, 2, 0] = 0.1, 5.0
     visible = np.array([[1.0, 0.0, 1.0]] * 4)

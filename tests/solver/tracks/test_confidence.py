@@ -1,4 +1,4 @@
-"""Fractional confidence is a weight: half of it twice is one of it once, and very little of it is none."""
+"""Fractional confidence is a weight: two halves equal one, and a very low one equals hidden."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SPOILED = np.where(WRONG[..., None], POINTS + 150.0, POINTS)
 LITTLE, NOTHING = np.where(WRONG, 1e-6, 1.0), np.where(WRONG, 0.0, 1.0)
 
 
-def test_a_point_given_twice_with_shared_confidence_is_a_point_given_once() -> None:
+def test_duplicated_points_that_share_confidence_equal_single_points() -> None:
     share = RNG.uniform(0.1, 0.9, POINTS.shape[:2])
     once = normalize(Tracks.from_arrays(POINTS))
     twice = normalize(
@@ -28,7 +28,7 @@ def test_a_point_given_twice_with_shared_confidence_is_a_point_given_once() -> N
     assert twice.unit == pytest.approx(once.unit, rel=1e-12)
 
 
-def test_a_frame_given_twice_with_shared_confidence_is_a_frame_given_once() -> None:
+def test_duplicated_frames_that_share_confidence_equal_single_frames() -> None:
     basis, points = RNG.normal(size=(10, 2, 4)), normalize(MADE.tracks).points
     weight, spread = RNG.uniform(0.2, 1.0, points.shape[:2]), np.diag([3.0, 2.0, 1.0])
     once, _ = coefficients_of(points, weight, basis, spread, 0.1, sweeps=1)
@@ -47,7 +47,7 @@ def test_a_value_of_weight_n_counts_n_times_in_the_median() -> None:
     assert weighted_median(values, np.full(31, 0.3)) == np.median(values)
 
 
-def test_only_the_ratios_of_confidences_count_in_the_completion() -> None:
+def test_completion_depends_only_on_the_ratios_of_confidences() -> None:
     weight = RNG.uniform(0.3, 1.0, POINTS.shape[:2])
     weight[0, 0] = 1.0
     full, half = (complete(normalize(Tracks.from_arrays(SPOILED, weight * factor))) for factor in (1.0, 0.5))
@@ -55,7 +55,7 @@ def test_only_the_ratios_of_confidences_count_in_the_completion() -> None:
     assert half.outliers == pytest.approx(full.outliers)
 
 
-def test_wrong_observations_of_little_confidence_are_as_good_as_hidden_in_the_completion() -> None:
+def test_completion_ignores_outliers_of_very_low_confidence() -> None:
     little, hidden, trusted = (
         complete(normalize(Tracks.from_arrays(SPOILED, visible))) for visible in (LITTLE, NOTHING, None)
     )
@@ -69,7 +69,7 @@ def test_wrong_observations_of_little_confidence_are_as_good_as_hidden_in_the_co
     [Settings(prior="smooth"), pytest.param(Settings(order="film"), marks=pytest.mark.slow)],
     ids=["smooth", "gaussian"],
 )
-def test_wrong_observations_of_little_confidence_are_as_good_as_hidden_in_a_solve(settings: Settings) -> None:
+def test_solve_ignores_outliers_of_very_low_confidence(settings: Settings) -> None:
     cameras = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
     little, hidden = (
         solve(Tracks.from_arrays(SPOILED, visible), MADE.mesh, cameras=cameras, settings=settings)

@@ -28,7 +28,7 @@ def shuffled(tracks: Tracks, order: np.ndarray = SHUFFLED) -> Tracks:
     return Tracks.from_arrays(tracks.points[order], tracks.visible[order])
 
 
-def test_differences_are_those_of_common_points() -> None:
+def test_frame_differences_use_only_common_points() -> None:
     random = np.random.default_rng(0)
     points, visible = random.normal(size=(4, 9, 2)), random.uniform(0.1, 1, (4, 9))
     visible[1, 3:] = 0
@@ -56,7 +56,7 @@ def test_a_film_and_shuffled_frames_are_told_apart() -> None:
 
 
 @pytest.mark.parametrize("share", [0.02, 0.1, 0.2])
-def test_gross_outliers_do_not_turn_a_film_into_photographs(share: float) -> None:
+def test_gross_outliers_do_not_change_the_detected_order(share: float) -> None:
     film = gallery.face(20, 200)
     order = np.random.default_rng(1).permutation(20)
     spoiled = gallery.corrupt(film, outliers=share, seed=0).tracks
@@ -72,12 +72,12 @@ def test_points_that_stand_still_do_not_count() -> None:
     assert resolved_order(shuffled(mixed, np.random.default_rng(1).permutation(20)), Settings())[0].order == "any"
 
 
-def test_the_order_is_not_known_where_no_two_frames_have_a_point_in_common() -> None:
+def test_the_order_is_undefined_if_no_two_frames_share_a_point() -> None:
     apart = Tracks.from_arrays(np.random.default_rng(0).normal(size=(3, 9, 2)), np.kron(np.eye(3), np.ones(3)))
     assert np.isnan(step_share(apart))
 
 
-def test_the_order_of_their_own_follows_from_the_content() -> None:
+def test_content_order_does_not_depend_on_the_input_order() -> None:
     between = differences(FACE.tracks)
     one = content_order(between)
     other = content_order(between[np.ix_(SHUFFLED, SHUFFLED)])
@@ -108,7 +108,7 @@ def test_permuted_frames_give_permuted_shapes(known: bool) -> None:
     assert not found.shapes.flags.writeable
 
 
-def test_the_energies_do_not_know_the_order_of_the_frames() -> None:
+def test_unordered_energies_are_invariant_to_frame_permutations() -> None:
     random, frames = np.random.default_rng(1), 7
     tracks = random.normal(size=(frames, 2, 40))
     rotations, order = exponential(random.normal(0, 0.4, (frames, 3))), random.permutation(frames)
@@ -136,7 +136,7 @@ def test_the_energies_do_not_know_the_order_of_the_frames() -> None:
     assert (np.abs(film[0] - film[1]) > 1e-3).all()
 
 
-def test_the_gradient_without_an_order_is_that_of_finite_differences() -> None:
+def test_the_unordered_gradient_matches_finite_differences() -> None:
     random, frames = np.random.default_rng(2), 6
     tracks = random.normal(size=(2 * frames, 30))
     scene = Scene.of(
@@ -154,7 +154,7 @@ def test_the_gradient_without_an_order_is_that_of_finite_differences() -> None:
         assert gradient[place] == pytest.approx(rise / 2e-5, rel=1e-4, abs=1e-7)
 
 
-def test_what_no_order_cannot_do_is_refused() -> None:
+def test_unsupported_order_settings_are_rejected() -> None:
     with pytest.raises(InvalidSettings, match="prior gaussian") as refused:
         Settings(order="any", prior="smooth")
     assert refused.value.field == "options.order"

@@ -13,7 +13,7 @@ def some_tracks(seed: int = 0) -> np.ndarray:
     return 40 * random.standard_normal((6, 30, 2)) + 300 * random.standard_normal((6, 1, 2))
 
 
-def test_centroid_zero_radius_one_and_back() -> None:
+def test_normalized_tracks_have_zero_centroid_and_unit_radius() -> None:
     points = some_tracks()
     found = normalize(Tracks.from_arrays(points))
     np.testing.assert_allclose(found.points.mean(axis=1), 0, atol=1e-12)
@@ -49,7 +49,7 @@ def test_one_extreme_outlier_does_not_change_the_unit() -> None:
     assert np.abs(found.points[3, 4]).min() > 1e5
 
 
-def test_one_position_for_all_points_is_refused() -> None:
+def test_coincident_points_are_rejected() -> None:
     with pytest.raises(InvalidInput, match="points that differ") as caught:
         normalize(Tracks.from_arrays(np.full((3, 5, 2), 7.0)))
     assert caught.value.code == "no_extent"
