@@ -1,6 +1,6 @@
-"""What every error about an invalid value states: code, field, what was expected, what was given, and what to do about it.
+"""The base class of errors about invalid values: code, field, expected value, given value and remedy.
 
-The members are those of a problem document. Only the standard library is imported, so the solver can use it too.
+The attributes are members of a problem document. Only the standard library is imported, so that the solver can use it, too.
 """
 
 from __future__ import annotations
@@ -8,26 +8,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 SIDES = ("field", "expected", "got", "hint")
-"""Attributes of every error of this kind, beside its code."""
+"""Attributes of `Invalid`, besides its code."""
 
 
 class Invalid(Exception):
-    """Something given is invalid. The rooms derive their own errors from it, together with their own base class.
+    """A given value is invalid. Each package derives its errors from this class and from its own base class.
 
     Attributes
     ----------
     code : str
         Stable machine-readable name of the fault, e.g. ``"too_few_frames"``.
     field : str
-        What is at fault, e.g. ``"tracks"``, ``"mesh.faces"`` or ``"options.seed"``.
+        The invalid input, e.g. ``"tracks"``, ``"mesh.faces"`` or ``"options.seed"``.
     expected, got : str
         What was expected and what was given, in words.
     hint : str
-        What the user can do about it: a whole sentence.
+        What the user can do about it, as a complete sentence.
     """
 
     def __init__(self, code: str, *, field: str, expected: str, got: str, hint: str) -> None:
-        Exception.__init__(self, f"{field}: expected {expected}, got {got}. {hint}")  # a sibling class may ask for more
+        Exception.__init__(self, f"{field}: expected {expected}, got {got}. {hint}")  # siblings may need more arguments
         self.code = code
         self.field = field
         self.expected = expected
@@ -36,5 +36,5 @@ class Invalid(Exception):
 
 
 def members_of(error: BaseException) -> Mapping[str, object]:
-    """Return the members that an error contributes to its problem document; those that it does not have are left out."""
+    """Return the members that an error contributes to its problem document, without those that it does not have."""
     return {name: value for name in (*SIDES, "choices") if (value := getattr(error, name, None)) is not None}

@@ -69,7 +69,7 @@ class Problem(Record):
         status : int, optional
             HTTP status code, if not the code's own.
         detail : str
-            A whole sentence that ends with what to do.
+            A complete sentence that ends with what to do.
         **members
             Further members, e.g. those of an error: `pliant.schemas.invalid.members_of`.
         """
@@ -81,7 +81,7 @@ class Problem(Record):
 
 
 class FollowedPoints(Record):
-    """Some points of a film in the frame that was tracked last."""
+    """A sample of a film's points in the frame that was tracked last."""
 
     frame: int = Field(ge=0, description="Number of the frame in the film, from 0.")
     seconds: float = Field(ge=0, description="From the film's start.")
@@ -119,7 +119,7 @@ class Artifact(Record):
 
 
 class Estimate(Record):
-    """What a job is expected to need, from the numbers of its frames and points. Right within a factor of about two."""
+    """Expected memory and time of a job, from its numbers of frames and points. Correct within a factor of about two."""
 
     memory_bytes: int = Field(description="Largest memory of the process that works on the job.")
     seconds: float = Field(description="Processor seconds on one core of a usual machine.")
@@ -235,14 +235,14 @@ class Job(Record):
     @field_validator("options", mode="before")
     @classmethod
     def _leave_out_unknown_options(cls, given: object) -> object:
-        """Read a job of a newer service: unknown options are an error in requests, but ignored in records."""
+        """Drop unknown options, so that jobs of newer services can be read; in requests they are an error."""
         if not isinstance(given, dict):
             return given
         return {name: value for name, value in given.items() if name in Options.model_fields}
 
 
 class Upload(Record):
-    """A large input that is uploaded separately and then named by jobs."""
+    """A large input that is uploaded separately and then referenced by jobs."""
 
     id: str
     offset: int = Field(description="Bytes received.")

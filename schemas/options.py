@@ -40,7 +40,7 @@ def _in_order(given: tuple[Output, ...]) -> tuple[Output, ...]:
 
 
 def _matching(given: str, *, pattern: str, words: str) -> str:
-    """Return the text if it matches; else raise ValueError with words and an example, which say more than the pattern."""
+    """Return the text if it matches; else raise ValueError with `words`, which are clearer than the pattern."""
     if re.fullmatch(pattern, given) is None:
         raise ValueError(words)
     return given
@@ -67,7 +67,7 @@ Outputs = Annotated[tuple[Output, ...], Field(max_length=64), BeforeValidator(_l
 
 
 class Options(BaseModel):
-    """How to reconstruct. Every option has a default; unknown names are rejected."""
+    """Options of a reconstruction. Every option has a default; unknown names are rejected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -1,4 +1,4 @@
-"""The wire contract of further files: what to write of a stored result."""
+"""The wire contract of requests for further files of a stored result."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pliant.schemas.options import Options, Outputs
 from pydantic import BaseModel, ConfigDict, Field
 
 RESTATED = ("fps", "normals", "colours", "axes", "glb_quantized", "glb_motion")
-"""Options of a job that a request for further files may state anew."""
+"""Options of a job that a request for further files may override."""
 
 
 class OutputRequest(BaseModel):
-    """Files to write of a stored result. Each option that is null stays as the job has it."""
+    """Files to write from a stored result. Options that are null keep the job's values."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -22,13 +22,13 @@ class OutputRequest(BaseModel):
     fps: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] | None = Field(
         None, description="Frames per second of the written animation."
     )
-    normals: Literal["static", "animated", "none"] | None = Field(None, description="As the option of a job.")
-    colours: Literal["none", "error", "expected_error"] | None = Field(None, description="As the option of a job.")
-    axes: Literal["tracks", "viewer"] | None = Field(None, description="As the option of a job.")
-    glb_quantized: bool | None = Field(None, description="As the option of a job.")
-    glb_motion: Literal["auto", "frames"] | None = Field(None, description="As the option of a job.")
+    normals: Literal["static", "animated", "none"] | None = Field(None, description="As in the options of a job.")
+    colours: Literal["none", "error", "expected_error"] | None = Field(None, description="As in the options of a job.")
+    axes: Literal["tracks", "viewer"] | None = Field(None, description="As in the options of a job.")
+    glb_quantized: bool | None = Field(None, description="As in the options of a job.")
+    glb_motion: Literal["auto", "frames"] | None = Field(None, description="As in the options of a job.")
 
     def applied_to(self, options: Options) -> Options:
-        """Return the options of a job with the outputs and the restated options of this request."""
+        """Return the options of a job with the outputs and the overridden options of this request."""
         stated = {name: getattr(self, name) for name in RESTATED if getattr(self, name) is not None}
         return options.model_copy(update={"outputs": self.outputs, **stated})

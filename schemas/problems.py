@@ -18,7 +18,7 @@ RETRYABLE_STATUSES = frozenset({408, 429, 503, 504, 507})
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Explanation:
-    """What the table states about a code."""
+    """The table's entry for an error code."""
 
     section: str
     title: str
@@ -42,12 +42,12 @@ class ProblemCode(StrEnum):
 
     @property
     def heading(self) -> str:
-        """Short name for people."""
+        """Short human-readable name."""
         return explanations()[self].title
 
     @property
     def cause(self) -> str:
-        """When it occurs."""
+        """When the error occurs."""
         return explanations()[self].cause
 
     @property
@@ -243,7 +243,7 @@ class ProblemCode(StrEnum):
 
 @cache
 def explanations() -> dict[str, Explanation]:
-    """Return the table: what it states about every code, in its order."""
+    """Return the table: the entry for every code, in the order of the file."""
     table = tomllib.loads(Path(__file__).with_name("problems.toml").read_text(encoding="utf-8"))
     return {
         code: Explanation(section=section, **entry) for section, codes in table.items() for code, entry in codes.items()
@@ -251,10 +251,10 @@ def explanations() -> dict[str, Explanation]:
 
 
 def type_of(code: str) -> str:
-    """Return the relative reference that a problem document has as its `type`."""
+    """Return the `type` of a problem document: a relative reference to the explanation of the code."""
     return f"/errors/{code}"
 
 
 def find_code(code: str) -> ProblemCode | None:
-    """Return the code of this text, or None for a code that this version does not know."""
+    """Return the error code with this name, or None if this version does not know it."""
     return ProblemCode.__members__.get(code.upper())

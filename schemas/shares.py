@@ -1,4 +1,4 @@
-"""The wire contract of share links: read-only access to one job's results, for a while."""
+"""The wire contract of share links: temporary, read-only access to one job's results."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 DAY = 24 * 3600
 SHARE_PREFIX = "share."
-"""How the token of a share link begins; other bearer tokens begin differently."""
+"""Prefix of a share link's token, which distinguishes it from other bearer tokens."""
 
 
 class ShareRequest(BaseModel):
-    """How long a share link is valid."""
+    """Request for a share link."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -1,4 +1,4 @@
-"""What pydantic expected of a value, in words that continue the word "expected"."""
+"""Descriptions of the values that pydantic expected, phrased to follow the word "expected"."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ _LENGTHS = {
     "string_too_short": ("at least", "min_length", "character"),
     "string_too_long": ("at most", "max_length", "character"),
 }
-"""Kinds of errors about a length: the words before it, its name in the error's context, and its unit."""
+"""Types of errors about a length: the words before the limit, its key in the error's context, and its unit."""
 
 
 def expectation(error: Mapping[str, Any]) -> str:
-    """Return what one of `ValidationError.errors()` expected, such as ``'l1', 'l2' or 'huber'`` or ``greater than 0``."""
+    """Describe what one of `ValidationError.errors()` expected, such as ``'l1', 'l2' or 'huber'`` or ``greater than 0``."""
     if error["type"] == "missing":
         return "a value"
     if error["type"] in _LENGTHS:

@@ -1,4 +1,4 @@
-"""Films to dense tracks: what a film shows of a surface, as points that can be reconstructed.
+"""Dense point tracks from films, ready for reconstruction.
 
     from pliant.tracking import track_film
 

@@ -1,4 +1,4 @@
-"""What may spoil a reconstruction from a film, in sentences that say what to film instead."""
+"""Warnings about a film or its tracks that may spoil a reconstruction, with advice on what to film instead."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ FEW_FRAMES = 10
 """Frames below which a film rarely holds enough motion for a shape."""
 
 STILL_SHARE = 0.01
-"""Motion below this share of the region's size counts as none: about the noise of the tracks on a region of 50 pixels."""
+"""Share of the region's size below which motion counts as none: about the track noise on a region of 50 pixels."""
 
 UNEVEN = 1.5
 """Ratio of longest to median time between frames above which the rate counts as variable."""
 
 
 def warnings_before(film: Film, found: Survey, start: int, stop: int, *, whole: bool, rough: float) -> list[str]:
-    """Judge the film itself: region, shots, length, rate, texture."""
+    """Return warnings about the film in rows `start` to `stop`: region, shots, length, frame rate, and texture in a share `rough`."""
     notes = []
     if whole:
         notes.append(
@@ -48,11 +48,11 @@ def warnings_before(film: Film, found: Survey, start: int, stop: int, *, whole: 
 
 
 def warnings_of(tracks: NDArray[np.float32], visible: NDArray[np.bool_], template: int) -> list[str]:
-    """Judge the tracks: motion and hidden share."""
+    """Return warnings about the tracks: little motion, many hidden points."""
     notes = []
     size = float(np.hypot(*np.ptp(tracks[template], axis=0)))
     moved = np.zeros(visible.shape[1])
-    for points, seen in zip(tracks, visible, strict=True):  # one frame at a time, for their memory
+    for points, seen in zip(tracks, visible, strict=True):  # one frame at a time, to save memory
         np.maximum(moved, np.linalg.norm(points - tracks[template], axis=1), out=moved, where=seen)
     if np.median(moved) < STILL_SHARE * size:
         notes.append(

@@ -1,4 +1,4 @@
-"""Does a frame still show what the template showed? Correlation of patches that bend with the tracks."""
+"""Visibility from appearance: correlate patches of the template, deformed with the tracks, with a frame."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from numpy.typing import NDArray
 from pliant.tracking.flow import Bools, Floats, Grey
 
 LEAST_CORRELATION = 0.6
-"""Below, a point is hidden: two thirds of the patch's variance (1 − .6²) are then unexplained, which closed flow cycles do not notice. On a
-rendered face behind a bar, .6 instead of .5 removes 8 % of the wrongly visible observations and .3 % of the right ones."""
+"""Correlation below which a point is hidden: two thirds of the patch's variance (1 − .6²) are then unexplained, which closed flow cycles do
+not reveal. On a rendered face behind a bar, .6 instead of .5 removes 8 % of the wrongly visible observations and .3 % of the right ones."""
 
 LOST_NEIGHBOURS = 2
-"""A point with so many hidden neighbours on the grid is hidden too: it lies at the edge of what hides them, where flow mixes the
-two motions. On rendered films with an occluder this removes a
-quarter to a half of the wrongly visible points and hides 2 to 3 % of the right ones."""
+"""Number of hidden grid neighbours that hides a point too: it lies at the edge of an occluder, where flow mixes the two motions. On
+rendered films with an occluder this removes a quarter to a half of the wrongly visible points and hides 2 to 3 % of the right ones."""
 
 PATCH_OFFSETS = np.stack(np.meshgrid(*[np.arange(-6, 7, 2, dtype=np.float32)] * 2), axis=-1).reshape(-1, 2)
-"""Sample places of a patch in pixels around its point: 7 × 7, two pixels apart."""
+"""Sample positions of a patch relative to its point, px: 7 × 7, two pixels apart."""
 
 POINTS_AT_ONCE = 512
-"""Points compared together: their patches (100 KB an array) stay in a core's cache."""
+"""Points per block, so that their patches (100 KB per array) stay in a core's cache."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,11 +51,10 @@ class Appearance:
         return cls(points, neighbours, _centred(patches), noise_variance(template))
 
     def agrees(self, frame: Grey, points: Floats, visible: Bools, *, pool: ThreadPoolExecutor | None = None) -> Bools:
-        """Compare a frame with the template at tracked points `(P, 2)`; return which of the visible ones stay so, shape `(P,)`.
+        """Compare a frame with the template at tracked points `(P, 2)`; return which visible points stay visible, shape `(P,)`.
 
-        The patches follow the tracks' local affine map, estimated from visible neighbours on the grid. The variance of the noise
-        is added to the patches' own, so that two flat patches count as equal. The result does not depend on the threads of
-        `pool`.
+        The patches follow the tracks' local affine maps, estimated from visible neighbours on the grid. The noise variance is added to the
+        patches' own, so that two flat patches count as equal. The result does not depend on the number of threads in `pool`.
         """
         image, affine = smooth(frame), self._affine(points, visible)
         seen = visible & _by_blocks(
@@ -72,7 +70,7 @@ class Appearance:
         return np.asarray(_dot(patches, template) + floor >= LEAST_CORRELATION * np.sqrt(norms))
 
     def _affine(self, points: Floats, visible: Bools) -> Floats:
-        """Differences to the neighbours over the template's differences, shape `(P, 2, 2)`; identity where unknown."""
+        """Estimate local affine maps from the differences to grid neighbours, shape `(P, 2, 2)`; identity where unknown."""
         affine = np.tile(np.eye(2, dtype=np.float32), (len(points), 1, 1))
         for axis in (0, 1):
             pair = self.neighbours[:, 2 * axis : 2 * axis + 2]
@@ -88,25 +86,25 @@ class Appearance:
 
 
 def noise_variance(image: Grey) -> float:
-    """Estimate the variance of an image's noise from the median of a difference that planes and edges hardly raise (Immerkær 1996)."""
+    """Estimate an image's noise variance from the median response of a kernel that ignores planes and most edges (Immerkær 1996)."""
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
     response = np.abs(cv2.filter2D(image, cv2.CV_32F, kernel))
     return float((np.median(response) / 0.6745) ** 2 / 36)
 
 
 def smooth(image: Grey) -> Floats:
-    """Return an image as it is compared, blurred by a binomial of 3 × 3 pixels."""
+    """Blur an image with a 3 × 3 binomial filter, as patches are compared."""
     return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (3, 3), 0), dtype=np.float32)
 
 
 def _by_blocks(function: Callable[[slice], NDArray[Any]], count: int, pool: ThreadPoolExecutor | None) -> NDArray[Any]:
-    """Join what a function returns for blocks of points; the blocks do not depend on the number of threads."""
+    """Concatenate a function's results for blocks of points; the blocks do not depend on the number of threads."""
     blocks = [slice(start, min(start + POINTS_AT_ONCE, count)) for start in range(0, max(count, 1), POINTS_AT_ONCE)]
     return np.concatenate(list(map(function, blocks) if pool is None else pool.map(function, blocks)))
 
 
 def _offsets(affine: Floats) -> Floats:
-    """Places of the patches' samples relative to their points, shape `(P, 49, 2)`."""
+    """Return the patches' sample positions relative to their points, shape `(P, 49, 2)`."""
     return np.asarray(PATCH_OFFSETS @ affine.transpose(0, 2, 1))
 
 
@@ -119,9 +117,9 @@ def _centred(patches: Floats) -> Floats:
 
 
 def cut(image: Floats, places: Floats) -> Floats:
-    """Interpolate an image `(H, W)` or `(H, W, C)` at places `(P, K, 2)`, rounded to 1/32 pixel; the border repeats."""
+    """Interpolate an image `(H, W)` or `(H, W, C)` at positions `(P, K, 2)`, rounded to 1/32 pixel; the border repeats."""
     x, y = (np.ascontiguousarray(places[..., axis], dtype=np.float32) for axis in (0, 1))
-    # OpenCV keeps sizes of maps in 16 bits, so many points go in blocks.
+    # OpenCV stores the sizes of maps in 16 bits, so many points are split into blocks.
     blocks = [
         cv2.remap(image, x[part], y[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         for part in (slice(start, start + 30_000) for start in range(0, len(x), 30_000))

@@ -1,11 +1,11 @@
-"""Tracks from flow: long- and short-range candidates, the most certain of which wins.
+"""Chain optical flow into tracks, choosing the most certain of long- and short-range candidates.
 
-After MFT (Neoral, Šerých, Matas, WACV 2024): a point of the template reaches frame t directly, or through its place in a
-frame shortly before t. Variances add along the way, a point that one link loses is lost for that candidate, and the
-candidate of least variance among those that see the point is taken.
+After MFT (Neoral, Šerých, Matas, WACV 2024): a point of the template reaches frame t directly, or via its position in a frame shortly
+before t. Variances add along the way, a candidate loses a point if one of its links does, and of the candidates that see the point the one
+with the least variance is taken.
 
-Flow depends on the points only by the box in which it is computed. That to the next frame is computed while this frame's points are
-registered.
+Flow depends on the points only through the box in which it is computed, so the flow to the next frame is computed while the points of this
+frame are registered.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ from pliant.tracking.flow import Bools, Floats, Grey, Match, dense_flow, match
 from pliant.tracking.registration import Registration
 
 DELTAS = (1, 8)
-"""Frames back from t of the candidates beside the template itself; MFT has 1, 2, 4, 8, 16, 32. On four rendered films and 177 frames of a
-real one, {∞, 1, 4, 16} has the same median error to 2 % and takes a third more flows. Without 8, a talking head of 120 frames keeps .71 of
-its points instead of .81."""
+"""Offsets in frames, before t, of the candidates besides the template; MFT uses 1, 2, 4, 8, 16, 32. On four rendered films and 177 frames
+of a real one, {∞, 1, 4, 16} has the same median error to 2 % and needs a third more flows. Without 8, a talking head of 120 frames keeps
+.71 of its points instead of .81."""
 
 STEP_VARIANCE = 0.01
-"""Variance of one flow whose cycle closes exactly, square pixels: 0.1 px, the accuracy of DIS on textured surfaces."""
+"""Variance of a flow whose cycle closes exactly, square pixels: (0.1 px)², the accuracy of DIS on textured surfaces."""
 
 FIRST_STEPS = 2
-"""Gauss–Newton steps of the registration, which `track_again` repeats. With 4 the final errors on a rendered face are 4 % smaller."""
+"""Gauss–Newton steps of the first registration; `track_again` registers again. With 4 the final errors on a rendered face are 4 %
+smaller."""
 
 FLOW_MARGIN = 32
 """Pixels around the points within which flow is computed: twice the largest patch that DIS searches at its coarsest scale."""
@@ -50,13 +51,13 @@ class Chain:
     """Shape `(F, P)`."""
 
     variance: Floats
-    """Of the places, square pixels, shape `(F, P)`, see `Registration.refine`."""
+    """Variance of the positions, square pixels, shape `(F, P)`; see `Registration.refine`."""
 
     @property
     def confidence(self) -> Floats:
-        """Median variance of the visible places over a place's own, at most 1; 0 where hidden, shape `(F, P)`.
+        """Median variance of the visible positions over a position's own, at most 1; 0 where hidden, shape `(F, P)`.
 
-        Places in the template are exact. Where most visible places are in it, the median is that of the others.
+        Positions in the template are exact. If most visible positions are in the template, the median excludes them.
         """
         found = self.variance[self.visible]
         elsewhere = found[found > 0]
@@ -68,7 +69,7 @@ class Chain:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _State:
-    """What is known of the points in one frame: a frame's row of `Chain`, and the variance of the flows that lead there."""
+    """State of the points in one frame: its row of `Chain`, and the summed variance `along` of the flows that lead there."""
 
     points: Floats
     visible: Bools
@@ -87,10 +88,10 @@ def chain(
     on_frame: OnFrame,
     should_stop: Callable[[], bool],
 ) -> Chain:
-    """Track the points `(P, 2)` of a template, a frame's index, to both ends of the film.
+    """Track the points of a template to both ends of the film; `template` is its frame index.
 
-    `read` returns grey frames by index. `on_frame` is called after every tracked frame with its index, the points in pixels of
-    the tracker's frames, and which are visible; `should_stop` is asked before every frame.
+    `read` returns grey frames by index. `on_frame` is called after every tracked frame with its index, the points in pixels of the
+    tracker's frames, and their visibility; `should_stop` is called before every frame.
 
     Raises
     ------
@@ -136,7 +137,7 @@ class _Link:
 
     @classmethod
     def of(cls, first: Grey, second: Grey, box: tuple[slice, slice], pool: ThreadPoolExecutor) -> _Link:
-        """Begin to compute both flows."""
+        """Start computing both flows in `pool`."""
         one, other = np.ascontiguousarray(first[box]), np.ascontiguousarray(second[box])
         corner = np.array([box[1].start, box[0].start], dtype=np.float32)
         return cls(corner, pool.submit(dense_flow, one, other), pool.submit(dense_flow, other, one))
@@ -150,10 +151,9 @@ class _Link:
 def _links(
     read: Read, t: int, direction: int, template: int, recent: dict[int, _State], near: Floats, pool: ThreadPoolExecutor
 ) -> dict[int, _Link]:
-    """Begin to compute the flows to frame t, by the frame that they come from.
+    """Start computing the flows to frame t; return them by source frame.
 
-    Flow is computed around the visible points of that frame, where they are known yet, and the places `near` t: elsewhere it costs
-    time and decides nothing.
+    Flow is computed around the visible points of the source frame, if already known, and around the positions `near` t only.
     """
     frame, links = read(t), {}
     for s in (template, *(t - direction * delta for delta in DELTAS if abs(t - template) > delta)):
@@ -163,7 +163,7 @@ def _links(
 
 
 def _two_frames_on(before: _State, latest: _State) -> Floats:
-    """Return where the visible points are and, as nearly all move about alike, where they will be after two more frames."""
+    """Return the visible points and, since most points move alike, their predicted positions two frames later."""
     seen = latest.points[latest.visible]
     drift = 2 * np.median(seen - before.points[latest.visible], axis=0)
     return np.concatenate([seen, seen + drift])
@@ -191,9 +191,9 @@ def _advance(
     registration: Registration,
     pool: ThreadPoolExecutor,
 ) -> _State:
-    """Find the points in a frame from the states of the frames between the template and it."""
+    """Locate the points in a frame from the states of frames between the template and this frame."""
     states, matches = [recent[s] for s in links], [link.carry(recent[s].points) for s, link in links.items()]
-    # Slow turning and bending steepen the long flow from the template everywhere; there a gradient is no sign of an edge.
+    # Turning and bending steepen the long flow from the template everywhere, so its gradient does not indicate an edge.
     lost = [m.lost if s == template else m.lost | m.boundary for s, m in zip(links, matches, strict=True)]
     visible = np.stack([state.visible & ~gone for state, gone in zip(states, lost, strict=True)])
     along = np.stack([state.along + m.gap + STEP_VARIANCE for state, m in zip(states, matches, strict=True)])

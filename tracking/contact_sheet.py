@@ -1,4 +1,4 @@
-"""Tracks drawn over some frames of their film, to judge them at a glance."""
+"""Draw tracks over some frames of their film, to judge them at a glance."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 COLUMNS = 3
 ACROSS = 20
-"""Points drawn across the region, about: every point would hide the picture."""
+"""Approximate number of points drawn across the region; all points would hide the picture."""
 
 TAIL = 6
-"""Frames of each track's past that are drawn."""
+"""Number of past frames of each track that are drawn."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sheet:
-    """What a contact sheet shows; see `TrackedFilm` for the arrays that have its names."""
+    """Content of a contact sheet; see `TrackedFilm` for the arrays of the same names."""
 
     thumbnails: NDArray[np.uint8]
     thumbnail_frames: NDArray[np.int64]
@@ -28,13 +28,13 @@ class Sheet:
     template: int
     frame_times: NDArray[np.float64]
     width: int
-    """Of the film in pixels."""
+    """Width of the film in pixels."""
 
 
 def draw_contact_sheet(sheet: Sheet, *, quality: int = 85) -> bytes:
-    """Draw visible points and their last steps over every thumbnail; returns a JPEG.
+    """Draw visible points and their last steps over every thumbnail; return a JPEG.
 
-    A point's colour is its place in the template, so that the same surface has the same colour in all pictures.
+    A point's colour encodes its position in the template, so that a surface point has the same colour in all pictures.
     """
     frames = [int(frame) for frame in sheet.thumbnail_frames]
     colours = _colours(sheet.tracks[sheet.template])
@@ -69,7 +69,7 @@ def _draw(picture: NDArray[np.uint8], frame: int, sheet: Sheet, colours: NDArray
 
 
 def _colours(points: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Hue by the angle around the middle of the template's points, saturation by the distance, shape `(P, 3)`, RGB."""
+    """Return RGB colours `(P, 3)`: hue from the angle around the template points' centre, saturation from the distance to it."""
     offset = points - points.mean(axis=0)
     angle = np.arctan2(offset[:, 1], offset[:, 0]) / (2 * np.pi) % 1.0
     radius = np.linalg.norm(offset, axis=1)

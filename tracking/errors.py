@@ -1,7 +1,7 @@
 """Errors of the tracker.
 
 TrackingError              base: catch this one
-├── FilmError              a film, region or option that cannot be used; states both sides and what to do
+├── FilmError              an unusable film, region or option; has expected, got and a hint
 └── TrackingStopped        `should_stop` returned True
 """
 
@@ -24,4 +24,4 @@ class TrackingStopped(TrackingError):
 
 
 class FilmError(Invalid, TrackingError):
-    """A film, a region or an option that cannot be used; the hint often tells what to film instead."""
+    """A film, region or option cannot be used; the hint often suggests what to film instead."""

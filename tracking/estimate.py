@@ -1,4 +1,4 @@
-"""What tracking a film would take, from one of its frames: how many points, and how much time on this machine."""
+"""Estimate the number of points and the time of tracking a film on this machine, from one of its frames."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from pliant.tracking.seeding import Seeds, default_step, neighbours, place
 from pliant.tracking.survey import tracking_scale
 
 FLOWS = 2 * (1 + len(DELTAS))
-"""Flows for each frame: there and back, from the template and from each earlier frame."""
+"""Flows per frame: forward and backward, from the template and from each earlier frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What tracking would take."""
+    """Estimated effort of tracking."""
 
     points: int
-    """Points that would be followed, before those that are soon lost are dropped."""
+    """Points that would be tracked, before short-lived ones are dropped."""
 
     seconds: float
-    """Wall time of flow, registration and comparison; decoding, and fitting the paths of all points, come on top. 0 without points or where
-    the film states no number of frames."""
+    """Wall time of flow, registration and comparison, without decoding and without fitting the points' paths. 0 without points or if the
+    film gives no number of frames."""
 
 
 def estimate(
     film: Film, *, region: Region | None, region_frame: int, grid_step: float | None, longest_side: int, threads: int
 ) -> Estimate:
-    """Place the points in the region's frame; time one flow of the region's size, and what else a frame takes.
+    """Place the points in the region's frame; time one flow of the region's size, and the other work per frame.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def estimate(
 
 
 def _frame(film: Film, index: int, longest_side: int) -> tuple[Grey, float]:
-    """Return the first selected frame from `index` on, else the last one, grey and in the tracker's size, with its scale."""
+    """Return the first selected frame from `index` on, or the last one, grey and in the tracker's size, with its scale."""
     image = None
     for frame in film.frames():
         image = frame.image
@@ -78,14 +78,14 @@ def _flow_seconds(grey: Grey, mask: np.ndarray[tuple[int, ...], np.dtype[np.bool
     box = np.s_[row.min() : row.max() + 1, column.min() : column.max() + 1]
     first = np.ascontiguousarray(np.pad(grey[box], FLOW_MARGIN, mode="edge"))
     second = np.ascontiguousarray(np.roll(first, 1, axis=1))
-    dense_flow(first, second)  # the first call sets up the library
+    dense_flow(first, second)  # the first call initialises the library
     began = time.perf_counter()
     dense_flow(first, second)
     return time.perf_counter() - began
 
 
 def _rounds_seconds(grey: Grey, seeds: Seeds) -> float:
-    """Time what both rounds do in a frame besides flow, on the frame itself, from half a pixel beside every point."""
+    """Time the work of both rounds per frame besides flow: register and compare the frame with itself, half a pixel off."""
     appearance = Appearance.of(grey, seeds.points, neighbours(seeds.grid, len(seeds.points)))
     registration = Registration.of(grey, seeds.points, seeds.grid, noise=appearance.noise)
     beside, visible = seeds.points + np.float32(0.5), np.ones(len(seeds.points), dtype=bool)

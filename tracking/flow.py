@@ -16,10 +16,10 @@ Bools = NDArray[np.bool_]
 Grey = NDArray[np.uint8]
 
 CYCLE_RATIO, CYCLE_FLOOR = 0.01, 0.5
-"""A match is lost where |w + ŵ|² ≥ ratio · (|w|² + |ŵ|²) + floor, floor in square pixels (Sundaram et al., equation 5)."""
+"""A match is lost if |w + ŵ|² ≥ ratio · (|w|² + |ŵ|²) + floor, floor in square pixels (Sundaram et al., equation 5)."""
 
 EDGE_RATIO, EDGE_FLOOR = 0.01, 0.002
-"""A motion boundary: |∇u|² + |∇v|² > ratio · |w|² + floor (Sundaram et al., equation 6)."""
+"""A motion boundary is where |∇u|² + |∇v|² > ratio · |w|² + floor (Sundaram et al., equation 6)."""
 
 _SERIAL = threading.Lock()
 _serial_users = 0
@@ -28,19 +28,19 @@ _threads_before = 0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
-    """Where points of one frame lie in another, with the evidence for it."""
+    """Positions of one frame's points in another, with measures of their consistency."""
 
     points: Floats
     """Shape `(P, 2)`, pixels of the second frame."""
 
     gap: Floats
-    """Squared distance between a point and where the flow there and back leads, square pixels, shape `(P,)`."""
+    """Squared distance between a point and where the flow forward and back leads, square pixels, shape `(P,)`."""
 
     lost: Bools
-    """The cycle does not close, or the point left the image, shape `(P,)`."""
+    """Points whose cycle does not close, or that left the image, shape `(P,)`."""
 
     boundary: Bools
-    """The point lies on a motion boundary of the flow back, shape `(P,)`."""
+    """Points on a motion boundary of the backward flow, shape `(P,)`."""
 
 
 @contextmanager
@@ -73,7 +73,7 @@ def dense_flow(first: Grey, second: Grey) -> Floats:
 
 
 def match(forward: Floats, backward: Floats, points: Floats) -> Match:
-    """Carry points `(P, 2)` along the flow from one frame to another, `(H, W, 2)`, and test the way back."""
+    """Carry points `(P, 2)` along the forward flow `(H, W, 2)`, and check them with the backward flow."""
     step = sample(forward, points)
     landed = points + step
     back = sample(backward, landed)
@@ -87,7 +87,7 @@ def match(forward: Floats, backward: Floats, points: Floats) -> Match:
 
 
 def sample(field: Floats, points: Floats) -> Floats:
-    """Interpolate a field `(H, W, C)` bilinearly at points `(P, 2)`; outside, the nearest border value holds."""
+    """Interpolate a field `(H, W, C)` bilinearly at points `(P, 2)`; outside, the border value is repeated."""
     height, width = field.shape[:2]
     x = np.clip(points[:, 0], 0, width - 1)
     y = np.clip(points[:, 1], 0, height - 1)

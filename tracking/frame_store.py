@@ -16,9 +16,10 @@ CACHED = 24
 
 
 class FrameStore:
-    """Append frames, then read them by index; delete the file by leaving the `with` block.
+    """Append frames, then read them by index; leaving the `with` block deletes the file.
 
-    Seeking in films is inexact for several containers, and decoding backwards costs a decode of everything before.
+    The film itself cannot be read in any order: seeking is inexact for several containers, and decoding backwards costs a decode of all
+    earlier frames.
     """
 
     def __init__(self) -> None:
@@ -49,7 +50,7 @@ class FrameStore:
         self._places.append((start, len(packed)))
 
     def read(self, index: int) -> Grey:
-        """Return frame `index`; any thread may call."""
+        """Return frame `index`; thread-safe."""
         with self._lock:
             if index in self._cache:
                 self._cache.move_to_end(index)

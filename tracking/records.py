@@ -1,4 +1,4 @@
-"""What the tracker reports and returns."""
+"""Progress reports and results of the tracker."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Stage = Literal["read", "locate", "track"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Followed:
-    """Points in one frame, to be shown while tracking runs."""
+    """Points in one frame, for display while tracking runs."""
 
     index: int
     """Number of the frame in the whole film, from 0."""
@@ -25,7 +25,7 @@ class Followed:
     """Seconds from the film's start."""
 
     points: NDArray[np.float32]
-    """In the film's pixels, shape `(P, 2)`."""
+    """Positions in the film's pixels, shape `(P, 2)`."""
 
     visible: NDArray[np.bool_]
     """Shape `(P,)`."""
@@ -36,17 +36,17 @@ class TrackingStep:
     """Progress of one stage."""
 
     stage: Stage
-    """"read": decode the film; "locate": find the region in the template; "track": follow the points, then once more from where
-    all frames lead to expect them."""
+    """"read": decode the film; "locate": find the region in the template; "track": follow the points, then follow them again from positions
+    predicted from all frames."""
 
     done: int
-    """Frames of this stage that are done; "track" counts those that are tracked again as well."""
+    """Completed frames of this stage; in "track", frames of the second pass count as well."""
 
     total: int | None
-    """Frames of this stage; None while the film's length is not known."""
+    """Frames of this stage; None while the film's length is unknown."""
 
     followed: Followed | None = field(default=None, compare=False)
-    """Where the points are in the frame just done; only of "track"."""
+    """Points in the frame just completed; only in "track"."""
 
 
 OnStep = Callable[[TrackingStep], None]
@@ -54,7 +54,7 @@ OnStep = Callable[[TrackingStep], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilmInfo:
-    """What was found in a film."""
+    """Properties of a film."""
 
     name: str
     container: str
@@ -62,13 +62,13 @@ class FilmInfo:
     """Width and height in pixels, upright: rotation flags are applied."""
 
     fps: float
-    """Frames a second, from the times of the frames used."""
+    """Frames per second, from the times of the frames used."""
 
     frame_indices: NDArray[np.int64]
     """Numbers of the frames used, counted in the whole film from 0, shape `(F,)`."""
 
     frame_times: NDArray[np.float64]
-    """Seconds from the film's start, shape `(F,)`; not evenly spaced for films of variable rate."""
+    """Seconds from the film's start, shape `(F,)`; not evenly spaced for films of variable frame rate."""
 
     cuts: tuple[int, ...]
     """Frame numbers at which a new shot begins."""
@@ -86,7 +86,7 @@ class TrackedFilm:
     """Shape `(F, P)`."""
 
     confidence: NDArray[np.float32]
-    """At most 1: the film's median variance over that of the observation; 0 where hidden, shape `(F, P)`."""
+    """The film's median variance over that of the observation, at most 1; 0 where hidden, shape `(F, P)`."""
 
     grid: NDArray[np.int32]
     """Point of every grid cell, −1 for holes, shape `(rows, columns)`."""
@@ -107,10 +107,10 @@ class TrackedFilm:
     """Some frames in colour, 320 pixels wide, shape `(N, h, w, 3)`."""
 
     thumbnail_frames: NDArray[np.int64]
-    """Their indices among the F frames, shape `(N,)`."""
+    """Indices of the thumbnails among the F frames, shape `(N,)`."""
 
     warnings: tuple[str, ...]
-    """What may spoil a reconstruction, in sentences."""
+    """Sentences about what may spoil a reconstruction."""
 
     @property
     def frame_times(self) -> NDArray[np.float64]:
@@ -119,7 +119,7 @@ class TrackedFilm:
 
     @property
     def fps(self) -> float:
-        """Frames a second."""
+        """Frames per second."""
         return self.film.fps
 
     @property

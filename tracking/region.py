@@ -1,4 +1,4 @@
-"""The region to track: a mask picture or a polygon, and its place in another frame."""
+"""The region to track, from a mask picture or a polygon, and its transport to another frame."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from pliant.tracking.seeding import Seeds, neighbours, quads
 Region = NDArray[np.bool_] | NDArray[np.uint8] | Sequence[Sequence[float]] | Path | str
 
 LONG_STEP = 2
-"""Frames between the stations on a region's way to the template; longer ones lose fast motion."""
+"""Frames per step when a region is carried to the template; longer steps lose fast motion."""
 
 
 def read_region(region: Region, size: tuple[int, int]) -> Bools:
-    """Turn a region into a mask, shape `(H, W)`.
+    """Convert a region to a mask, shape `(H, W)`.
 
-    It is a path to a mask picture of the film's size, its array `(H, W)` (bool, or uint8 with 128 and more inside), or a polygon,
-    `(N, 2)` pixels with N ≥ 3. Where a picture has transparency, opaque is inside.
+    The region is the path of a mask picture of the film's size, an array `(H, W)` (bool, or uint8 with 128 and above inside), or a polygon
+    of pixels `(N, 2)` with N ≥ 3. In pictures with transparency, opaque pixels are inside.
 
     Raises
     ------
@@ -62,8 +62,8 @@ def transport(
 ) -> Bools:
     """Carry a region from one frame to another and return its mask there.
 
-    The grid's points are carried from the start and, in steps, from frame to frame; the better of the two wins, as in
-    `chaining`. The mask is the union of the faces whose corners all arrive, closed over one grid step.
+    The grid's points are carried directly from the start and, in steps, from frame to frame; the more certain result is taken, as in
+    `chaining`. The mask is the union of the faces whose corners are all visible, closed over one grid step.
     """
     points, seen = seeds.points, np.ones(len(seeds.points), dtype=bool)
     variance = np.zeros(len(points), dtype=np.float32)
@@ -90,7 +90,7 @@ def transport(
 
 
 def _cover(points: Floats, seen: Bools, seeds: Seeds, shape: tuple[int, ...]) -> Bools:
-    """Fill the faces of the grid that arrived."""
+    """Fill the faces whose corners are all visible, and close gaps of one grid step."""
     mask = np.zeros(shape, dtype=np.uint8)
     faces = quads(seeds.grid)
     corners = np.round(points[faces[seen[faces].all(axis=1)]]).astype(np.int32)
@@ -105,7 +105,7 @@ def _from_picture(path: Path, size: tuple[int, int]) -> Bools:
     try:
         with Image.open(path, formats=("PNG", "JPEG", "WEBP", "BMP", "GIF")) as picture:
             if picture.size != size:
-                return np.zeros(picture.size[::-1], dtype=bool)  # refused for its size, never decoded
+                return np.zeros(picture.size[::-1], dtype=bool)  # rejected for its size without being decoded
             if picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info:
                 alpha = np.asarray(picture.convert("RGBA"))[..., 3]
                 if alpha.min() < 128:

@@ -1,10 +1,10 @@
-"""Where a frame shows the points of a template: all points of the grid are registered together.
+"""Register all grid points of a template jointly to a frame.
 
-The picture between four neighbouring points moves bilinearly with them (Szeliski and Coughlan, Spline-based image registration, 1997).
-Gauss–Newton steps minimise the squared difference between the moved picture and the template at every pixel, plus the bending of the
-motion; brightness and contrast are free within a window. Pixels are not smoothed first, which would remove what tells neighbouring places
-apart. A point with little texture follows its neighbours, and no local affine map has to be estimated from noisy tracks. Every frame is
-compared with the same template, so that errors do not accumulate over the frames.
+The image between four neighbouring points moves bilinearly with them (Szeliski and Coughlan, Spline-based image registration, 1997).
+Gauss–Newton steps minimise the squared difference between the warped frame and the template at every pixel, plus the bending of the motion;
+brightness and contrast are free within a window. Pixels are not smoothed first, because this would remove the detail that distinguishes
+neighbouring positions. Points with little texture follow their neighbours, and no local affine maps have to be estimated from noisy tracks.
+Every frame is compared with the same template, so errors do not accumulate over the frames.
 """
 
 from __future__ import annotations
@@ -22,60 +22,60 @@ from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
 
 WINDOW = 21.0
-"""Side of the window in which brightness and contrast are free, pixels. On a rendered face, registered once, 13, 21 and 31 have median
+"""Side of the window in which brightness and contrast are free, pixels. On a rendered face, registered once, 13, 21 and 31 give median
 errors of .15, .13 and .13 px and root mean squares of .40, .37 and .37 px."""
 
 BENDING = 0.04
-"""Standard deviation of the motion's second differences over the distance of neighbouring points. On a rendered face of 640 × 480 pixels
-.03, .04 and .06 have median errors of .104, .106 and .116 px, and errors of the shapes of .0146, .0129 and .0138. All constants here were
-chosen on that face; films of a flag, a sphere and a paper were only measured."""
+"""Standard deviation of the motion's second differences over the distance of neighbouring points. On a rendered face of 640 × 480 pixels,
+.03, .04 and .06 give median errors of .104, .106 and .116 px, and shape errors of .0146, .0129 and .0138. All constants here were chosen
+on that face; films of a flag, a sphere and a paper served for checks only."""
 
 EDGE = 2.0
-"""Standard deviations beyond which a second difference counts less and less, so that the motion may have creases (Cauchy). It lowers the
-95th percentile of a rendered face's errors from 1.03 to .91 px; the median stays."""
+"""Scale of the Cauchy loss on second differences, in standard deviations; it permits creases in the motion. It lowers the 95th percentile
+of a rendered face's errors from 1.03 to .91 px and leaves the median unchanged."""
 
 OUTLIER = 3.0
-"""Standard deviations beyond which a difference of brightness counts less and less (Cauchy). 6 instead of 3 has errors 5 to 8 % larger."""
+"""Scale of the Cauchy loss on brightness differences, in standard deviations. 6 instead of 3 gives errors 5 to 8 % larger."""
 
 STEPS, ITERATIONS = 4, 15
-"""Gauss–Newton steps, and iterations of conjugate gradients in each. In the second round, 3 and 8 steps have errors 2 % larger and
-2 % smaller on a rendered face."""
+"""Gauss–Newton steps, and conjugate-gradient iterations in each. In the second round, 3 and 8 steps give errors 2 % larger and 2 % smaller
+on a rendered face."""
 
 LONGEST_STEP = 1.0
-"""Pixels that a point moves at most in one step. Not tuned."""
+"""Maximum motion of a point in one step, px. Not tuned."""
 
 DIFFERENCE = np.array([[1, -8, 0, 8, -1]], dtype=np.float32) / 12
-"""Derivative of a row of pixels, exact for polynomials of fourth degree."""
+"""Derivative of a row of pixels, exact for polynomials up to degree 4."""
 
 UNLIKE = 0.36
-"""Share of the template's contrast around a point that may remain unexplained; above it (correlation below .8) the frame shows something
-else there, and the point stays where it was."""
+"""Maximum unexplained share of the template's contrast around a point; above it (correlation below .8) the frame shows something else
+there, and the point keeps its position."""
 
 ROUNDING = 1e-4
-"""Least variance, square pixels."""
+"""Minimum variance, square pixels."""
 
 HOLD = 0.1
-"""Precision of the flow's places where nothing else is known, 1/px²: a deviation of 3 px. Not tuned; it keeps the system regular."""
+"""Precision of the pull towards the flow's positions, 1/px²: a standard deviation of 3 px. Not tuned; it keeps the system non-singular."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """A grid of points in a template, and what is compared between them: S places in the cells whose four corners are points."""
+    """A grid of points in a template, and S samples in the cells whose four corners are points."""
 
     points: Floats
     """Pixels of the template, shape `(P, 2)`."""
 
     cells: Cells
-    """The squares between four points, and the places in them."""
+    """The cells between four points, and the samples in them."""
 
     bending: sparse.csr_array
     """Second differences of a function of the points along rows, columns and diagonals, shape `(M, P)`."""
 
     window: Window
-    """Means around the places."""
+    """Local means around the samples."""
 
     template: Floats
-    """Grey levels at the places, shape `(S,)`."""
+    """Grey levels at the samples, shape `(S,)`."""
 
     step: float
     """Distance of neighbouring points, pixels."""
@@ -87,8 +87,8 @@ class Registration:
     def of(cls, template: Grey, points: Floats, grid: NDArray[np.int32], *, noise: float) -> Registration:
         """Prepare the registration of a template, a grey frame `(H, W)`.
 
-        Points `(P, 2)` are pixels on a regular grid `(rows, columns)` of their indices, −1 where there is none. `noise` is the
-        variance of the frames' noise, square grey levels.
+        `points (P, 2)` are pixel positions on a regular grid; `grid (rows, columns)` holds their indices, −1 where there is none. `noise`
+        is the variance of the frames' noise, square grey levels.
         """
         corners = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]], axis=-1)
         full = np.asarray((corners >= 0).all(axis=-1))
@@ -103,12 +103,12 @@ class Registration:
     def refine(
         self, frame: Grey, points: Floats, variance: Floats, visible: Bools, *, steps: int = STEPS
     ) -> tuple[Floats, Floats]:
-        """Move visible points from where flow leads to where a frame matches the template; return points and variances of the matches.
+        """Move visible points from their flow positions to where a frame matches the template; return points and variances.
 
-        Variances are in square pixels. Points that are not visible keep place and variance, as do those around which the frame
-        shows something else. The variance is that of the shift which would explain the remaining difference of brightness, the
-        mean squared residual around a point over the mean squared slope in the direction of least slope. Errors of the motion
-        model make it that large; noise of the film, which averages out over the window, makes it too large.
+        Variances are in square pixels. Points keep position and variance if they are hidden or if the frame shows something else around
+        them. The variance is that of the shift which would explain the remaining brightness difference: the mean squared residual around a
+        point over the mean squared slope in the direction of least slope. It is right for errors of the motion model and too large for film
+        noise, which averages out over the window.
         """
         shown = np.asarray(visible[self.cells.corners].all(axis=1))
         used = np.zeros(len(points), dtype=bool)
@@ -125,7 +125,7 @@ class Registration:
         return np.where(believed[:, None], moved, points), np.where(believed, left, variance)
 
     def _remaining(self, around: _Surroundings, picture: Floats, points: Floats) -> tuple[Floats, Floats]:
-        """Return the variance of all points, square pixels, and the share of the template's contrast that the frame does not explain."""
+        """Return the variance of all points, square pixels, and the unexplained share of the template's contrast around them."""
         values = cut(picture, self.cells.places(points)[:, None])[:, 0]
         residual, contrast = around.residual(values[:, 0])
         across, down = (values[:, 1:] / contrast[:, None]).T
@@ -138,7 +138,7 @@ class Registration:
         return np.asarray(variance, dtype=np.float32), np.asarray(unlike, dtype=np.float32)
 
     def _step(self, around: _Surroundings, picture: Floats, moved: Floats, flowed: Floats) -> Floats:
-        """Return the step of all points, shape `(P, 2)`."""
+        """Return one Gauss–Newton step of all points, shape `(P, 2)`."""
         values = cut(picture, self.cells.places(moved)[:, None])[:, 0]
         residual, contrast = around.residual(values[:, 0])
         slopes = values[:, 1:] / contrast[:, None]
@@ -167,29 +167,29 @@ class Registration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """The squares between four points; all have the same `K` places, whose positions follow the corners bilinearly: S = C K."""
+    """C cells between four points, each with the same `K` samples, whose positions are bilinear in the corners: S = C K."""
 
     corners: NDArray[np.int32]
     """Points at the corners of every cell, shape `(C, 4)`."""
 
     weights: Floats
-    """Of the corners at the places, shape `(K, 4)`."""
+    """Weights of the corners at the samples, shape `(K, 4)`."""
 
     products: Floats
-    """Of two corners' weights at the places, shape `(K, 16)`."""
+    """Products of two corners' weights at the samples, shape `(K, 16)`."""
 
     gather: sparse.csr_array
-    """Sums the cells' corners over the points, shape `(P, 4 C)`."""
+    """Matrix that sums the cells' corners by point, shape `(P, 4 C)`."""
 
     pairs: sparse.csr_array
-    """Sums the cells' pairs of corners over the N pairs of points that share a cell, shape `(N, 16 C)`."""
+    """Matrix that sums the cells' pairs of corners over the N pairs of points that share a cell, shape `(N, 16 C)`."""
 
     pattern: tuple[NDArray[np.int32], NDArray[np.int32]]
     """Columns and row pointers of these pairs in a matrix of P × P blocks."""
 
     @classmethod
     def of(cls, corners: NDArray[np.int32], side: int, num_points: int) -> Cells:
-        """Lay out `side` × `side` places in every cell."""
+        """Lay out `side` × `side` samples in every cell."""
         inside = (np.arange(side) + 0.5) / side
         right, down = (axis.ravel() for axis in np.meshgrid(inside, inside))
         weights = np.stack([(1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down], axis=1)
@@ -204,15 +204,15 @@ class Cells:
         )  # fmt: skip
 
     def places(self, points: Floats) -> Floats:
-        """Return where the places lie, shape `(S, 2)`, given the points `(P, 2)`."""
+        """Return the positions of the samples, shape `(S, 2)`, for points `(P, 2)`."""
         return np.asarray((self.weights @ points[self.corners]).reshape(-1, 2))
 
     def sums(self, values: Floats) -> Floats:
-        """Return the sums of values `(S,)` over the places around every point, by its weights there, shape `(P,)`."""
+        """Return the weighted sums of sample values `(S,)` around every point, shape `(P,)`."""
         return np.asarray(self.gather @ (values.reshape(len(self.corners), -1) @ self.weights).ravel())
 
     def normal(self, weight: Floats, slopes: Floats) -> sparse.bsr_array:
-        """Return the matrix of the normal equations, shape `(2P, 2P)`, of residuals with the given weights `(S,)` and slopes `(S, 2)`."""
+        """Return the normal equations' matrix `(2P, 2P)` for residuals with weights `(S,)` and slopes `(S, 2)`."""
         across, down = slopes.T
         xx, xy, yy = (
             self.pairs @ ((weight * product).reshape(len(self.corners), -1) @ self.products).ravel()
@@ -223,27 +223,27 @@ class Cells:
 
 
 def _sums(rows: NDArray[np.integer[Any]], count: int) -> sparse.csr_array:
-    """Return the matrix that adds the values of equal rows."""
+    """Return the matrix that sums values with the same row index."""
     columns = np.arange(len(rows))
     return sparse.csr_array((np.ones(len(rows), dtype=np.float32), (rows, columns)), shape=(count, len(rows)))
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Means over a window around every place: the places are pixels of a small picture, with gaps where there is no cell."""
+    """Means over a window around every sample: the samples are pixels of a small picture, with gaps where there is no cell."""
 
     pixel: NDArray[np.int64]
-    """Of every place, counted row by row, shape `(S,)`."""
+    """Pixel of every sample, counted row by row, shape `(S,)`."""
 
     shape: tuple[int, int]
-    """Of the picture."""
+    """Shape of the picture."""
 
     side: int
-    """Of the window, an odd number of pixels."""
+    """Side of the window, an odd number of pixels."""
 
     @classmethod
     def of(cls, full: Bools, side: int, *, width: float) -> Window:
-        """Lay out the places of the cells that are full, `side` × `side` in each; `width` in cells."""
+        """Lay out the samples of the full cells, `side` × `side` in each; `width` is the window's side in cells."""
         top, left = np.nonzero(full)
         within = np.arange(side * side)
         row = (top[:, None] * side + within // side).ravel()
@@ -252,7 +252,7 @@ class Window:
         return cls(row * shape[1] + column, shape, 2 * round(width * side / 2) + 1)
 
     def mean(self, values: Floats) -> Floats:
-        """Return the window's means of values `(S,)`, zero counting where there is no place."""
+        """Return the window means of values `(S,)`, with zero in the gaps."""
         picture = np.zeros(self.shape, dtype=np.float32)
         picture.reshape(-1)[self.pixel] = values
         blurred = cv2.boxFilter(picture, -1, (self.side, self.side), borderType=cv2.BORDER_CONSTANT)
@@ -261,20 +261,20 @@ class Window:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Surroundings:
-    """The template with brightness and contrast removed, over the places that a frame shows."""
+    """The visible samples of the template around a frame's match, with local brightness removed."""
 
     window: Window
     shown: Floats
-    """1 or 0, shape `(S,)`."""
+    """1 where a sample is visible, else 0, shape `(S,)`."""
 
     count: Floats
-    """Shares of the windows that are shown."""
+    """Visible share of each window."""
 
     template: Floats
-    """Grey levels without the windows' means, 0 where nothing is shown."""
+    """Grey levels minus the windows' means, 0 where hidden."""
 
     power: Floats
-    """Mean square of these, and the noise."""
+    """Mean square of `template` in each window, plus the noise."""
 
     noise: np.float32
 
@@ -286,11 +286,11 @@ class _Surroundings:
         return cls(window, shown, count, centred, window.mean(centred * centred) / count + noise, noise)
 
     def mean(self, values: Floats) -> Floats:
-        """Return means over the shown places around every shown one, 0 elsewhere."""
+        """Return means over the visible samples around every visible one, 0 elsewhere."""
         return self.shown * self.window.mean(values * self.shown) / self.count
 
     def residual(self, values: Floats) -> tuple[Floats, Floats]:
-        """Return a frame's values `(S,)` less the template, brightness and contrast adapted, and the contrast."""
+        """Return a frame's values `(S,)` minus the template, after matching brightness and contrast, and the contrast."""
         centred = (values - self.window.mean(values * self.shown) / self.count) * self.shown
         contrast = (self.window.mean(centred * self.template) / self.count + self.noise) / self.power
         contrast = np.clip(contrast, 0.5, 2.0)
@@ -298,7 +298,7 @@ class _Surroundings:
 
 
 def _bending(grid: NDArray[np.int32], num_points: int) -> sparse.csr_array:
-    """Return `Registration.bending`; the mixed difference counts twice, as in the Frobenius norm of the second derivatives."""
+    """Return the second differences; the mixed one counts twice, as in the Frobenius norm of the second derivatives."""
     root = float(np.sqrt(2.0))
     stencils = (
         ((1.0, -2.0, 1.0), (grid[:, :-2], grid[:, 1:-1], grid[:, 2:])),

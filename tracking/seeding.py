@@ -1,4 +1,4 @@
-"""Points to track: a grid inside the region, where the template has texture, and the mesh that the grid makes."""
+"""Points to track: a grid over the textured part of the region, and its mesh."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from pliant.tracking.flow import Bools, Floats, Grey
 Ints = NDArray[np.int32]
 
 GRID_STEPS = (4.0, 8.0)
-"""Least and largest default distance of neighbouring points, pixels of the tracker's frames. DIS has a match every 3 pixels of
-its finest level, 6 of the frame, so a finer grid adds points but little motion."""
+"""Minimum and maximum default distance of neighbouring points, pixels of the tracker's frames. DIS has a match every 3 pixels of its finest
+level, 6 of the frame, so a finer grid adds points but little motion."""
 
 WANTED_POINTS = 4000
-"""Points that the default distance aims at: the solver's working size for a mesh in minutes on two cores."""
+"""Target number of points for the default distance: the solver makes a mesh of this size in minutes on two cores."""
 
 TEXTURE_WINDOW = 11
-"""Side of the window over which texture is judged, pixels; the size of the patches that DIS compares."""
+"""Side of the window in which texture is measured, pixels; the size of the patches that DIS compares."""
 
 LEAST_TEXTURE = 0.25
-"""Least mean squared slope in the direction of least texture, beyond that of noise, (grey levels / pixel)²: half a grey level
-a pixel, the rounding of 8-bit film."""
+"""Minimum mean squared slope in the direction of least texture, beyond that of noise, (grey levels / pixel)²: half a grey level per pixel,
+the rounding of 8-bit film."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,10 +44,10 @@ def default_step(region: Bools) -> float:
 
 
 def place(template: Grey, region: Bools, *, step: float, everywhere: bool = False) -> tuple[Seeds, float]:
-    """Put points on a grid of `step` pixels inside a region, where there is texture or, if told so, everywhere.
+    """Place points on a grid of `step` pixels inside a region, where there is texture or, with `everywhere`, in all cells.
 
-    Single cells without texture between textured ones are kept, so that the mesh has no pinholes. Returns the points that belong
-    to at least one face, and the share of the region's cells that have texture.
+    Single cells without texture between textured ones are kept, so that the mesh has no pinholes. Returns the points that belong to at
+    least one face, and the share of the region's cells that have texture.
     """
     height, width = template.shape
     x, y = (np.arange(step / 2, side - 1, step) for side in (width, height))
@@ -76,7 +76,7 @@ def textured(image: Grey) -> Bools:
 
 
 def number(plane: Floats, wanted: Bools) -> Seeds:
-    """Give numbers to the wanted cells that belong to a face, row by row; drop rows and columns that hold none."""
+    """Assign numbers to the wanted cells that belong to a face, row by row; drop empty rows and columns."""
     square = wanted[:-1, :-1] & wanted[1:, :-1] & wanted[:-1, 1:] & wanted[1:, 1:]
     kept = np.zeros_like(wanted)
     for down in (0, 1):

@@ -1,4 +1,4 @@
-"""One pass over a film: its frames for the tracker, their times and sharpness, and where shots begin."""
+"""One pass over a film: store its frames for the tracker, and find times, sharpness and shot boundaries."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from pliant.tracking.frame_store import FrameStore
 from pliant.tracking.records import OnStep, TrackingStep
 
 ENLARGED_TO, LARGEST_ENLARGEMENT = 480, 3.0
-"""Small films are enlarged to this longest side in pixels, at most so many times: DIS matches at half the resolution it is
-given. On rendered films of 160×120, enlarging three times halves the median error (.53 to .25 px)."""
+"""Small films are enlarged to this longest side in pixels, at most by this factor: DIS matches at half the resolution it is given. On
+rendered films of 160×120, enlarging three times halves the median error (.53 to .25 px)."""
 
 THUMBNAIL = 96
-"""Longest side of the pictures in which cuts are sought, pixels."""
+"""Longest side of the thumbnails in which cuts are detected, pixels."""
 
 SAME_SHOT, CUT = 0.7, 0.4
-"""Correlation of successive thumbnails, the first carried by the flow: within a shot usually above the one, across a cut below
-the other."""
+"""Correlation of successive thumbnails after motion compensation: usually above the first value within a shot, below the second across a
+cut."""
 
 AROUND = 4
-"""Frames before and after a cut that are consulted: fast motion stays unlike for several frames, a cut is one step."""
+"""Frames compared before and after a cut: fast motion lowers the correlation for several frames, a cut for one."""
 
 BROKEN_SHARE = 0.95
-"""A film that decodes to less than this share of the frames it states has a broken tail; containers round by a few frames."""
+"""A film that decodes to less than this share of its declared frames has a broken tail; containers are off by a few frames."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Survey:
-    """What one pass found; rows are selected frames."""
+    """Result of one pass; rows are the selected frames."""
 
     indices: NDArray[np.int64]
     """Frame numbers in the whole film, shape `(N,)`."""
@@ -52,7 +52,7 @@ class Survey:
     """Pixels of the stored frames per pixel of the film."""
 
     broken_tail: bool
-    """The film ends before the frames it states."""
+    """Whether the film ends before its declared number of frames."""
 
 
 def survey(
@@ -63,7 +63,7 @@ def survey(
     Raises
     ------
     FilmError
-        Fewer than 3 frames, or what `Film.frames` raises.
+        Fewer than 3 frames, or an error of `Film.frames`.
     TrackingStopped
         `should_stop` returned True.
     """
@@ -108,7 +108,7 @@ def tracking_scale(size: tuple[int, int], longest_side: int) -> float:
 
 
 def find_cuts(likeness: NDArray[np.float64]) -> tuple[int, ...]:
-    """Find single unlike steps among alike ones; `likeness (N,)` is the correlation of every frame with the one before, at first 1."""
+    """Find single frames unlike their predecessor among alike ones; `likeness (N,)` is the correlation with the predecessor, at first 1."""
     cuts = []
     for t in np.flatnonzero(likeness < CUT):
         around = np.concatenate([likeness[max(0, t - AROUND) : t], likeness[t + 1 : t + 1 + AROUND]])
@@ -132,7 +132,7 @@ def _thumbnail(grey: Grey) -> Grey:
 
 
 def _likeness(first: Grey, second: Grey) -> float:
-    """Correlation of two thumbnails, as they are or the first carried along the flow, whichever is higher."""
+    """Return the correlation of two thumbnails, with or without motion compensation of the first, whichever is higher."""
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     flow = search.calc(second, first, None)  # type: ignore[call-overload]
     height, width = first.shape
@@ -142,7 +142,7 @@ def _likeness(first: Grey, second: Grey) -> float:
 
 
 def _correlation(first: Grey, second: Grey) -> float:
-    """Correlation with one grey level of noise added to both variances, so that two blank pictures are alike."""
+    """Return the correlation, with one grey level of noise added to both variances, so that two blank pictures are alike."""
     a, b = first - first.mean(), second - second.mean()
     return float(((a * b).mean() + 1.0) / np.sqrt(((a**2).mean() + 1.0) * ((b**2).mean() + 1.0)))
 

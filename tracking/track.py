@@ -28,22 +28,22 @@ from pliant.tracking.survey import Survey, sharpest, survey
 from pliant.tracking.trajectories import track_again
 
 LONGEST_SIDE = 960
-"""Default longest side of the tracker's frames, pixels: full HD is halved, which its compression hardly notices."""
+"""Default longest side of the tracker's frames, pixels: full HD is halved, which loses little after video compression."""
 
 LEAST_SEEN = 0.2
 """Share of the frames in which a point must be visible to be kept."""
 
 LEAST_POINTS = 16
-"""Points without which there is no surface to speak of: a 4 × 4 grid."""
+"""Minimum number of points for a surface: a 4 × 4 grid."""
 
 THUMBNAILS = 6
 THUMBNAIL_WIDTH = 320
-"""Pixels; small films are enlarged, so that drawn tracks leave something of the picture."""
+"""Pixels; small films are enlarged, so that drawn tracks do not cover the picture."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """What all stages need."""
+    """Resources shared by all stages."""
 
     film: Film
     store: FrameStore
@@ -54,7 +54,7 @@ class _Run:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Plan:
-    """What to track: rows `start` to `stop` of the survey, from a template, within a mask of the template in the tracker's size."""
+    """Rows `start` to `stop` of the survey, the template's row, and the mask of the template in the tracker's size."""
 
     start: int
     stop: int
@@ -76,39 +76,39 @@ def track_film(
     on_step: OnStep | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> TrackedFilm:
-    """Track a grid of points on the surface that a film shows.
+    """Track a grid of points on a surface in a film.
 
-    Flow is DIS (Kroeger et al. 2016), chained as in MFT (Neoral et al. 2024), tested by cycles (Sundaram et al. 2010) and by
-    correlation with the template. The result does not depend on the number of threads.
+    Flow is DIS (Kroeger et al. 2016), chained as in MFT (Neoral et al. 2024), checked by cycle consistency (Sundaram et al. 2010)
+    and by correlation with the template. The result does not depend on the number of threads.
 
     Parameters
     ----------
     film
         A path, see `open_film`, or an opened film.
     region
-        What to track, in `region_frame`: a mask picture's path, a mask `(H, W)`, or a polygon `(N, 2)`, all in the film's
-        pixels. Without it, the whole picture.
+        Region to track, in `region_frame`: the path of a mask picture, a mask `(H, W)`, or a polygon `(N, 2)`, all in the film's
+        pixels. By default, the whole picture.
     region_frame, template_frame
-        Frame numbers, counted in the whole film from 0; the nearest frame in use is taken. The template is the frame whose
+        Frame numbers, counted in the whole film from 0; the nearest selected frame is used. The template is the frame whose
         points are followed to both ends: by default the region's frame, or a sharp one in the middle if no region is given.
     grid_step
-        Distance of neighbouring points in the film's pixels; by default such that the region holds about 4,000 points, 4 to 8
-        pixels of the tracker's frames.
+        Distance of neighbouring points in the film's pixels; by default 4 to 8 pixels of the tracker's frames, chosen for about
+        4,000 points in the region.
     longest_side
         Longest side of the frames that are tracked, pixels; larger films are reduced. The tracks are in the film's own pixels.
     frames, limits
-        See `open_film`; for an opened film they are its own.
+        See `open_film`; ignored for a film that is already open.
     threads
-        Threads for optical flow; by default as many as the process may use cores, at most 4.
+        Threads for optical flow; by default one per available core, at most 4.
     on_step
         Called after every frame of every stage.
     should_stop
-        Asked at every frame of every stage.
+        Called at every frame of every stage; returning True stops the tracker.
 
     Raises
     ------
     FilmError
-        A film, region or option that cannot be used; the message says what to do, or what to film instead.
+        The film, the region or an option cannot be used; the message suggests what to do, or what to film instead.
     TrackingStopped
         `should_stop` returned True.
     """
@@ -126,7 +126,7 @@ def track_film(
 
 
 def _plan(run: _Run, found: Survey, mask: Bools | None, region_frame: int, template_frame: int | None) -> _Plan:
-    """Choose shot and template, and find the region there."""
+    """Choose shot and template, and carry the region there."""
     height, width = run.store.read(0).shape
     origin = _nearest(found, region_frame, "region_frame")
     edges = [0, *found.cuts, len(found.indices)]
@@ -157,7 +157,7 @@ def _plan(run: _Run, found: Survey, mask: Bools | None, region_frame: int, templ
 
 
 def _carry(run: _Run, mask: Bools, origin: int, template: int) -> Bools:
-    """Carry the region to the template; points without texture come along, for only the outline counts."""
+    """Carry the region to the template, with points without texture too, because only the outline counts."""
     step = default_step(mask)
     seeds, _ = place(run.store.read(origin), mask, step=step, everywhere=True)
     carried = transport(
@@ -173,7 +173,7 @@ def _carry(run: _Run, mask: Bools, origin: int, template: int) -> Bools:
 
 
 def _track(run: _Run, found: Survey, plan: _Plan, step: float | None, *, whole: bool) -> TrackedFilm:
-    """Seed, chain, drop points visible in few frames, and assemble the result."""
+    """Seed, chain, track again, drop points visible in few frames, and assemble the result."""
     template = run.store.read(plan.template)
     seeds, rough = place(template, plan.mask, step=step or default_step(plan.mask))
     if len(seeds.points) < LEAST_POINTS:
@@ -225,7 +225,7 @@ def _assemble(
     kept: NDArray[np.int64],
     notes: list[str],
 ) -> TrackedFilm:
-    """Return to the film's own pixels, in the chain's memory, and add pictures and warnings."""
+    """Convert the tracks to the film's pixels, in the chain's memory, and add pictures and warnings."""
     rows = slice(plan.start, plan.stop)
     width, height = run.film.size
     indices, times = found.indices[rows], found.times[rows]
@@ -249,7 +249,7 @@ def _assemble(
 
 
 def _in_film(points: Floats, scale: float) -> Floats:
-    """Return places in the film's own pixels, from those in the tracker's frames, which are `scale` times as large."""
+    """Convert positions from the tracker's frames, which are `scale` times as large, to the film's pixels."""
     return (points + np.float32(0.5)) / np.float32(scale) - np.float32(0.5)
 
 
@@ -274,7 +274,7 @@ def _pictures(
 
 
 def _nearest(found: Survey, frame: int, field: str) -> int:
-    """Row of the frame in use that is nearest to a frame number."""
+    """Return the row of the used frame nearest to a frame number."""
     if not 0 <= frame <= found.indices[-1]:
         raise FilmError(
             "no_such_frame", field=field, expected=f"a frame number from 0 to {found.indices[-1]}", got=str(frame),

@@ -1,9 +1,9 @@
-"""Tracks once more, from where the whole film leads to expect every point.
+"""Track once more, from the positions that the whole film predicts for every point.
 
-A frame alone does not tell a wrong match from a right one. Together the frames do: the paths of all points lie near a space of few
-dimensions, in which a path is determined by the frames that match well (Irani, Multi-frame correspondence estimation using subspace
-constraints, 2002; Garg, Roussos, Agapito, 2013). Every frame is registered again from the paths in this space, and points are
-looked for again where they had been lost.
+One frame alone cannot distinguish a wrong match from a right one, but all frames together can: the paths of all points lie near a
+low-dimensional space, in which the frames that match well determine a path (Irani, Multi-frame correspondence estimation using subspace
+constraints, 2002; Garg, Roussos, Agapito, 2013). Every frame is registered again from the paths in this space, and lost points are searched
+for there again.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ POINTS_AT_ONCE = 512
 """Points whose paths are computed together; all at once, in double precision, take six times the tracks' memory."""
 
 FRAMES_AHEAD = 8
-"""Frames whose registration waits or runs: two for each of the default's four threads at most."""
+"""Frames whose registration is queued or running: two for each of the default's four threads at most."""
 
 
 def move_to_expected(chained: Chain, should_stop: Callable[[], bool]) -> None:
-    """Put all points where their paths in a space of few dimensions lead, fitted to their places weighted by confidence.
+    """Move all points to their paths in a low-dimensional space, fitted to their positions weighted by confidence.
 
-    The space is fitted to a sample of the points. The number of its dimensions is the one that predicts held-out places best.
+    The space is fitted to a sample of the points. Its dimension is the one that best predicts held-out positions.
 
     Raises
     ------
@@ -66,9 +66,9 @@ def track_again(
     on_frame: OnFrame,
     should_stop: Callable[[], bool],
 ) -> None:
-    """Register every frame again from the expected places; points that look like the template there are visible again.
+    """Register every frame again from the predicted positions; points that match the template there become visible again.
 
-    The arguments are those of `chain`, and what it returned, whose arrays are overwritten.
+    Arguments are those of `chain`; `chained` is its result, whose arrays are overwritten.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""`python -m pliant.worker [work|reconcile|fsck]`: one worker, one reconciler or one check, configured by `PLIANT_…` variables."""
+"""`python -m pliant.worker [work|reconcile|fsck]`: run a worker, a reconciler or a check, configured by `PLIANT_…` variables."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ WATCH_ANSWERS_WITHIN = 2.0
 def work(settings: Settings) -> int:
     """Run jobs until a signal.
 
-    The modules of a job are loaded once, before the first fork. That is safe as long as this process computes nothing:
+    The modules of a job are imported once, before the first fork. This is safe because this process does no numerical work:
     the numerical library stops its threads in the fork and restarts them in the job process.
     """
     for variable in NUMERICAL_THREADS:
@@ -76,7 +76,7 @@ def reconcile(settings: Settings) -> int:
     jobs = Jobs.open(settings)
     sender = WebhookSender.open(settings, jobs.records)
     sender.start()
-    Reconciler(jobs=jobs).run(lambda: stopping or not sender.alive)  # the supervisor restarts it
+    Reconciler(jobs=jobs).run(lambda: stopping or not sender.alive)  # the supervisor restarts a failed sender
     sender.stop()
     return 0
 
@@ -98,7 +98,7 @@ def main(arguments: list[str]) -> int:
     try:
         logs, settings = read(LogSettings), Settings.from_environment()
         configure_logging(logs.log_level, logs.log_format)
-        with suppress(StoreUnavailable):  # each task deals with a store that is away
+        with suppress(StoreUnavailable):  # each task handles an unavailable store itself
             prepare(settings)
         return task(settings)
     except WorkerError as error:

@@ -1,7 +1,7 @@
-"""Reads a record of settings: the environment first, then `.env` in the working directory, then the folder of secret files.
+"""Read settings records: from the environment first, then `.env` in the working directory, then the folder of secret files.
 
-A record is a frozen Pydantic dataclass. Its field NAME is the variable PLIANT_NAME; the field's default, bounds and description
-are the only place where they stand: `pliant.worker.settings` and `pliant.service.settings` are read alike.
+A record is a frozen Pydantic dataclass. Field NAME is read from the variable PLIANT_NAME; its default, bounds and description are
+defined only in the record. `pliant.worker.settings` and `pliant.service.settings` are both read this way.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ _BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less tha
 
 
 def variable_of(name: str) -> str:
-    """Return the environment variable of a field."""
+    """Return the name of a field's environment variable."""
     return f"{PREFIX}{name.upper()}"
 
 
 def fields_of(record: type[Any]) -> dict[str, FieldInfo]:
-    """Return the fields of a record of settings with their types, defaults and bounds."""
+    """Return the fields of a settings record with their types, defaults and bounds."""
     assert is_pydantic_dataclass(record), record
     return dict(record.__pydantic_fields__)
 
 
 def expected_of(field: FieldInfo) -> str:
-    """Return what a variable may hold, in words: the field's description, or what its type and bounds say."""
+    """Return a text for the valid values of a field: its description, or its type and bounds."""
     if field.description is not None:
         return field.description
     kinds = [kind for kind in get_args(field.annotation) if kind is not type(None)] or [field.annotation]
@@ -53,7 +53,7 @@ def expected_of(field: FieldInfo) -> str:
 
 
 def read(record: type[T]) -> T:
-    """Return the record that the environment, `.env` and the secret files describe; an empty variable counts as unset.
+    """Read a settings record from the environment, `.env` and the secret files; an empty variable counts as unset.
 
     Raises
     ------
@@ -65,12 +65,12 @@ def read(record: type[T]) -> T:
 
 
 def given(record: type[Any]) -> frozenset[str]:
-    """Return the names of the fields that the environment, `.env` or the secret files give a value. Raises as `read`."""
+    """Return the names of the fields set by the environment, `.env` or the secret files. Raises the same errors as `read`."""
     return frozenset(_found(record).model_fields_set)
 
 
 def _found(record: type[Any]) -> BaseModel:
-    # Here, because only a process of the service or of a worker reads its settings: the SDK works without the extra `server`.
+    # Imported here because the SDK works without the extra `server`; only services and workers read settings.
     from pydantic_settings import BaseSettings, SettingsConfigDict
 
     known = fields_of(record)
@@ -89,7 +89,7 @@ def _found(record: type[Any]) -> BaseModel:
         @model_validator(mode="before")
         @classmethod
         def drop_empty(cls, given: dict[str, Any]) -> dict[str, Any]:
-            return {name: value for name, value in given.items() if value != ""}  # of empty secret files
+            return {name: value for name, value in given.items() if value != ""}  # empty secret files
 
     spelled: dict[str, Any] = {name: (field.annotation, field) for name, field in known.items()}
     try:

@@ -1,6 +1,6 @@
 """Errors of the worker package; `WorkerError` is the base of all.
 
-Every one carries a stable `code`, a whole sentence (`str(error)`) and whether the same request may succeed later.
+Each error has a stable `code`, a message that is a complete sentence, and a flag `retryable`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class WorkerError(Exception):
 
 
 class UnknownJob(WorkerError):
-    """There is no job of that id, or it belongs to another owner."""
+    """No job has this id, or it belongs to another owner."""
 
     code = "unknown_job"
 
@@ -67,7 +67,7 @@ class UnknownShare(WorkerError):
 
 
 class UnknownToken(WorkerError):
-    """There is no token of that id."""
+    """No token has this id."""
 
     code = "unknown_token"
 
@@ -76,7 +76,7 @@ class UnknownToken(WorkerError):
 
 
 class UnknownUpload(WorkerError):
-    """There is no upload of that id, or it belongs to another owner."""
+    """No upload has this id, or it belongs to another owner."""
 
     code = "unknown_upload"
 
@@ -104,7 +104,7 @@ class Conflict(WorkerError):
 
 
 class OffsetMismatch(Invalid, Conflict):
-    """The offset of the bytes is not the current size of the upload."""
+    """The offset of the request differs from the current size of the upload."""
 
     def __init__(self, id: str, *, expected: int, got: int) -> None:
         hint = f"Continue at {expected}."
@@ -115,7 +115,7 @@ class OffsetMismatch(Invalid, Conflict):
 
 
 class InvalidRequest(Invalid, WorkerError):
-    """A malformed id, cursor or key."""
+    """A value in a request, such as an id, a cursor or a key, is malformed or out of range."""
 
 
 class UploadTooLarge(InvalidRequest):
@@ -129,7 +129,7 @@ class UploadTooLarge(InvalidRequest):
 
 
 class TooManyUploads(WorkerError):
-    """The owner's limit of uploads is reached."""
+    """The owner's limit on uploads is reached."""
 
     code = "too_many_uploads"
     retryable = True
@@ -141,7 +141,7 @@ class TooManyUploads(WorkerError):
 
 
 class TooManyShares(WorkerError):
-    """A job has as many valid share links as it may have."""
+    """The job's limit on valid share links is reached."""
 
     code = "too_many_shares"
 
@@ -150,7 +150,7 @@ class TooManyShares(WorkerError):
 
 
 class InvalidSetting(Invalid, WorkerError):
-    """A setting does not parse, is out of range, or leaves an installation that cannot be used."""
+    """A setting does not parse, is out of range, or makes the installation unusable."""
 
     def __init__(
         self, variable: str, *, expected: str, got: str, hint: str = "Correct the variable or leave it unset."
@@ -159,7 +159,7 @@ class InvalidSetting(Invalid, WorkerError):
 
 
 class TooManyQueued(WorkerError):
-    """The owner's limit of queued jobs is reached."""
+    """The owner's limit on queued jobs is reached."""
 
     code = "too_many_queued"
     retryable = True
@@ -196,7 +196,7 @@ class StoreUnavailable(WorkerError):
 
 
 class DataDirectoryInUse(WorkerError):
-    """Another Pliant runs on the data directory."""
+    """Another Pliant process uses the data directory."""
 
     code = "data_directory_in_use"
 
@@ -205,13 +205,13 @@ class DataDirectoryInUse(WorkerError):
 
 
 class NewerData(WorkerError):
-    """A newer version wrote what is stored."""
+    """The stored data was written by a newer version."""
 
     code = "newer_data"
 
     def __init__(self, *, found: int, known: int) -> None:
         super().__init__(
-            f"The records were written by a newer Pliant (version {found} of their form; this one reads up to {known}). "
+            f"The records were written by a newer Pliant (record format {found}; this version reads up to {known}). "
             "Install that Pliant, or restore a backup that was made before the upgrade."
         )
 
@@ -223,7 +223,7 @@ class BadBackup(WorkerError):
 
 
 class ServerFailed(WorkerError):
-    """The embedded Valkey does not start."""
+    """The embedded Valkey cannot be started."""
 
     code = "server_failed"
 
@@ -241,7 +241,7 @@ class Interrupted(WorkerError):
 
 
 class TimedOut(WorkerError):
-    """A reconstruction took longer than its options allow."""
+    """A reconstruction took longer than its option `time_limit` allows."""
 
     code = "timed_out"
     retryable = True

@@ -1,4 +1,4 @@
-"""Synthetic example sequences, as input files in the formats of the readers."""
+"""Synthetic example sequences, as input files in formats that the readers accept."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Write = Callable[[Sequence], bytes]
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """One example: its title, how it is generated, and its files by form part."""
+    """An example: its title, its generator, and its files as pairs of form field and file name."""
 
     name: str
     title: str
@@ -47,7 +47,7 @@ EXAMPLES = {
         Example("sphere", "breathing sphere", lambda: sphere(30, 500)),
     )
 }
-"""Examples that are solved within seconds, each with a defect: noise, outliers or hidden points."""
+"""Examples that are solved within seconds. Each has noise, outliers or hidden points."""
 
 
 def example_file(name: str, file: str) -> bytes:

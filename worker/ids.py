@@ -11,7 +11,7 @@ _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{2,63}")
 
 
 def is_id(text: str) -> bool:
-    """Whether a job or an upload may have this id."""
+    """Return whether a job or an upload may have this id."""
     return _ID.fullmatch(text) is not None
 
 

@@ -1,4 +1,4 @@
-"""Logging of the process: a level, lines for people or JSON, and the id of the request behind every line."""
+"""Logging of one process: level, console or JSON format, and the request id in every line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LogLevel = Literal["debug", "info", "warning", "error"]
 LogFormat = Literal["console", "json"]
 
 REQUEST_ID: ContextVar[str] = ContextVar("pliant_request_id", default="-")
-"""The request that the current task or thread works for."""
+"""Id of the request that the current task or thread handles."""
 
 _NOISY = {
     "rq.worker": logging.WARNING,
@@ -21,12 +21,12 @@ _NOISY = {
     "uvicorn.error": logging.WARNING,
     "httpx": logging.WARNING,
 }
-"""Loggers of libraries, and the least level that is of use: `pliant up` reports start and stop itself."""
+"""Minimum levels of verbose library loggers; `pliant up` itself reports start and stop."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogSettings:
-    """How a worker or a reconciler logs; the API has the same variables among its own."""
+    """Log settings of a worker or reconciler; the service's own settings include the same variables."""
 
     log_level: LogLevel = "info"
     log_format: LogFormat = "console"
@@ -36,13 +36,13 @@ class AddRequestId(logging.Filter):
     """Adds `request_id` to every record."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Add it, and keep the record."""
+        """Add the request id; never drop the record."""
         record.request_id = REQUEST_ID.get()
         return True
 
 
 def configure_logging(level: LogLevel, format: LogFormat) -> None:
-    """Send all records of this process from a level on to standard error."""
+    """Send this process's log records of at least `level` to standard error."""
     handler = logging.StreamHandler()
     handler.addFilter(AddRequestId())
     handler.setFormatter(formatter(format))
@@ -52,7 +52,7 @@ def configure_logging(level: LogLevel, format: LogFormat) -> None:
 
 
 def formatter(format: LogFormat) -> logging.Formatter:
-    """Return the formatter; JSON lines carry every extra field of a record, times are RFC 3339 in UTC."""
+    """Return the formatter; JSON lines include every extra field of a record, and times as RFC 3339 in UTC."""
     if format == "console":
         return logging.Formatter("%(asctime)s %(levelname)s %(name)s [%(request_id)s]: %(message)s")
     return JsonFormatter(

@@ -11,7 +11,7 @@ FOLDERS = ("blobs", "incoming", "uploads", "valkey", "work")
 """Folders of a data directory."""
 
 LONGEST_SOCKET_PATH = 100
-"""Bytes; the system's own bound is 107 on Linux and 103 on macOS."""
+"""Maximum length of a socket path, bytes; the system's limit is 107 on Linux and 103 on macOS."""
 
 
 def make_data_directory(data: Path) -> None:
@@ -35,8 +35,8 @@ def valkey_directory(data: Path) -> Path:
 def socket_path(data: Path) -> Path:
     """Return the server's Unix socket: in the data directory, or in the temporary directory if that path is too long.
 
-    The short name is a hash of the long one and of the user, so that all processes with the same data directory find
-    the same socket.
+    The short path consists of the user id and a hash of the long path, so that all processes with the same data directory
+    find the same socket.
     """
     plain = valkey_directory(data) / "valkey.sock"
     if len(os.fsencode(plain)) <= LONGEST_SOCKET_PATH:

@@ -69,7 +69,7 @@ class Stored(BaseModel):
     """Blob of the canonical inputs."""
 
     result: str | None = None
-    """Blob of the arrays of a stored result, for a job that writes further files of it instead of solving."""
+    """Blob with the arrays of a stored result, for a job that writes further files from it instead of solving."""
 
     bytes: int = 0
     """Total size of the job's files, bytes."""
@@ -96,13 +96,13 @@ class Stored(BaseModel):
     """Links that read the job's results without a token of its owner."""
 
     trace: str | None = None
-    """W3C `traceparent` of the request that made the job, which its attempts continue; None: it was not traced."""
+    """W3C `traceparent` of the request that created the job, which its attempts continue; None: not traced."""
 
     version: int = 0
     """Number of changes, for the compare-and-set."""
 
     record_schema: int = Field(2, validation_alias="schema", serialization_alias="schema")
-    """Version of the record's own form; see `pliant.worker.store.schema`."""
+    """Version of the record's format; see `pliant.worker.store.schema`."""
 
     @property
     def sort_key(self) -> str:
@@ -132,7 +132,7 @@ class Beat(NamedTuple):
     max_running: int | None
     """See `Stored`."""
     priority: Priority
-    """Of the job, which orders the waiting jobs of its owner."""
+    """Priority of the job among its owner's waiting jobs."""
 
 
 Change = Callable[[Stored], Stored]
@@ -225,16 +225,16 @@ class Records(ABC):
         Raises
         ------
         UnknownJob
-            There is none of that id.
+            No job has this id.
         """
 
     @abstractmethod
     def find(self, key: str) -> Stored | None:
-        """Return the record of an idempotency key's digest."""
+        """Return the record with this digest of an idempotency key, None if there is none."""
 
     @abstractmethod
     def replace(self, before: Stored, after: Stored) -> bool:
-        """Write `after` if the stored version is still that of `before`; return whether it was."""
+        """Write `after` if the stored version is still that of `before`; return whether it was written."""
 
     @abstractmethod
     def delete(self, id: str, *, at: datetime) -> None:
@@ -255,7 +255,7 @@ class Records(ABC):
     def page(
         self, *, cursor: str | None, limit: int, statuses: Sequence[Status], owner: str | None
     ) -> tuple[list[Stored], str | None]:
-        """Return up to `limit` records, newest first, older than the cursor, and the next page's cursor."""
+        """Return up to `limit` records older than the cursor, newest first, and the next page's cursor, None on the last page."""
 
     @abstractmethod
     def ids(self, status: Status) -> list[str]:
@@ -271,7 +271,7 @@ class Records(ABC):
 
     @abstractmethod
     def tallies(self) -> dict[str, float]:
-        """Return the counters since the installation was created; see `counted` and `worker.outbox`."""
+        """Return the counters since the installation was created; see `counted` and `pliant.worker.store.outbox`."""
 
     @abstractmethod
     def used(self) -> int:
@@ -291,7 +291,7 @@ class Records(ABC):
 
     @abstractmethod
     def events(self, id: str, *, after: str | None) -> list[Event]:
-        """Return the job's events after one id (None: all that are kept)."""
+        """Return the job's events after the id `after`; None: all that are kept."""
 
     @abstractmethod
     def changes(self) -> Changes:
@@ -310,9 +310,9 @@ class Records(ABC):
         """Return normally if the store answers."""
 
     def update(self, id: str, change: Change) -> Stored:
-        """Apply a change, a pure function, to a record; repeat on the newer record after a concurrent write.
+        """Apply the pure function `change` to a record; after a concurrent write, apply it again to the newer record.
 
-        Its exceptions pass through without a write; returning its argument means no change.
+        Nothing is written if `change` raises an exception, which propagates, or returns its argument.
 
         Raises
         ------
@@ -330,7 +330,7 @@ class Records(ABC):
 
 
 def utc_now() -> datetime:
-    """Return the time."""
+    """Return the current time in UTC."""
     return datetime.now(UTC)
 
 

@@ -16,8 +16,8 @@ from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 NUMERICAL_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-"""Environment variables of the numerical libraries. Jobs set them to 1: the solver uses its own threads, and those of BLAS busy-wait,
-which slows down all processes on a loaded machine (`benchmarks/README.md`)."""
+"""Environment variables for the thread counts of numerical libraries. Jobs set them to 1: the solver has its own threads, and BLAS
+threads busy-wait, which slows down all processes on a loaded machine (`benchmarks/README.md`)."""
 
 
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
@@ -41,7 +41,7 @@ def _networks(text: str) -> str:
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False, description="a number of seconds, at least 0")]
 Bytes = Annotated[int, Field(ge=0, description="a whole number of bytes, at least 0")]
 Networks = Annotated[
-    str, AfterValidator(_networks), Field(description="networks such as 10.0.0.0/8, commas between them")
+    str, AfterValidator(_networks), Field(description="networks such as 10.0.0.0/8, separated by commas")
 ]
 
 
@@ -65,13 +65,13 @@ class Settings:
     """Number of jobs that run at once."""
 
     threads: int | None = Field(default=None, ge=1)
-    """Threads of the numerical libraries in one job; None: the usable cores shared evenly among the workers."""
+    """Threads of one job, for the solver and for optical flow; None: the usable cores shared evenly among the workers."""
 
     time_limit: Seconds = 3600.0
     """Time limit of one attempt; 0: no limit."""
 
     memory_limit: Bytes = 0
-    """Limit of a job's address space; 0: no limit. The libraries alone need half a gigabyte."""
+    """Limit on a job's address space; 0: no limit. The libraries alone need half a gigabyte."""
 
     cancel_grace: Seconds = 10.0
     """Time for a job to stop by itself after a cancellation or its time limit, before it is killed."""
@@ -86,32 +86,32 @@ class Settings:
     """Maximum number of attempts at a job whose workers are lost."""
 
     webhook_networks: Networks = ""
-    """Networks (CIDR, commas between them) whose addresses webhooks may be sent to although they are private, link-local,
-    loopback or otherwise not of the public internet."""
+    """Networks (CIDR, separated by commas) that webhooks may reach although their addresses are private, link-local, loopback or
+    otherwise not public."""
 
     max_running: int = Field(default=0, ge=0)
-    """Maximum number of running jobs per owner, the others wait; 0: no limit. Without tokens, all jobs have one owner."""
+    """Maximum number of running jobs per owner; further jobs wait. 0: no limit. Without tokens, all jobs have one owner."""
 
     retention: Seconds = 30 * 86400.0
     """Time for which a finished job and its files are kept; 0: indefinitely."""
 
     disk_quota: Bytes = 0
-    """Total bytes of all jobs above which new ones are rejected; 0: no quota."""
+    """Maximum total bytes of jobs and uploads, above which new ones are rejected; 0: no quota."""
 
     read_memory: int = Field(default=8 << 30, ge=1 << 30, description="a whole number of bytes, at least 1 GiB")
-    """Limit of the address space of the process that reads large inputs; inputs that need more are rejected as too_large."""
+    """Limit on the address space of the process that reads large inputs; inputs that need more are rejected as too_large."""
 
     film_memory: int = Field(default=4 << 30, ge=512 << 20, description="a whole number of bytes, at least 512 MiB")
-    """Address space of the process that decodes and tracks a film; what needs more is refused as too_large."""
+    """Limit on the address space of the process that decodes and tracks a film; films that need more are rejected as too_large."""
 
     film_frames: int = Field(default=3600, ge=3)
-    """Frames of one film that may be tracked."""
+    """Maximum number of tracked frames per film."""
 
     film_pixels: int = Field(default=4096 * 2304, ge=256)
-    """Width times height of a film."""
+    """Maximum width times height of a film, in pixels."""
 
     film_seconds: float = Field(default=600.0, ge=1, allow_inf_nan=False, description="a number of seconds, at least 1")
-    """Playing time of a film up to the last frame that is tracked."""
+    """Maximum playing time of a film up to the last tracked frame."""
 
     upload_expiry: Seconds = 86400.0
     """Time for which an upload is kept after its last byte or its last use by a job; 0: indefinitely."""
@@ -131,12 +131,12 @@ class Settings:
 
     @property
     def redis(self) -> str:
-        """URL of Redis: the given one, else that of the embedded server."""
+        """URL of Redis; by default the embedded server's."""
         return self.redis_url or f"unix://{quote(str(socket_path(self.data)))}"
 
     @property
     def blobs(self) -> str:
-        """URL of the blob store: the given one, else a directory inside `data`."""
+        """URL of the blob store; by default the directory `blobs` inside `data`."""
         return self.blob_url or (self.data.absolute() / "blobs").as_uri()
 
     @property
@@ -156,5 +156,5 @@ class Settings:
 
     @property
     def threads_per_job(self) -> int:
-        """Threads the numerical libraries may use in one job."""
+        """Number of threads of one job."""
         return self.threads or max(1, usable_cores() // self.workers)

@@ -1,7 +1,7 @@
 """Bearer tokens: create, verify, revoke.
 
 A token has the form ``pliant_<id>_<secret>``. The id selects the record, which contains only the SHA-256 of the complete token,
-so that the store reveals no usable token. The secret has 256 random bits; a slow hash is unnecessary, as it cannot be guessed.
+so that the store reveals no usable token. A slow hash is unnecessary, because a secret of 256 random bits cannot be guessed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ PREFIX = "pliant_"
 LONGEST_TOKEN_NAME = 100
 
 LONGEST_LIFETIME = timedelta(days=999_999)
-"""Longest time until a token expires, so that its end is a date: years end at 9999."""
+"""Maximum lifetime of a token, so that its expiry is a valid `datetime`, whose years end at 9999."""
 
 _FORM = re.compile(PREFIX + r"([0-9a-f]{12})_([A-Za-z0-9_-]{43})", re.ASCII)
 _DURATION = re.compile(r"([1-9][0-9]{0,5})([smhdw])", re.ASCII)
@@ -39,9 +39,9 @@ class Scope(StrEnum):
     """Permissions of a token. `admin` includes the others; `read` and `submit` are independent."""
 
     READ = "read"
-    """Read jobs of its owner and download their files."""
+    """Read the owner's jobs and download their files."""
     SUBMIT = "submit"
-    """Submit jobs; cancel, retry and delete those of its owner."""
+    """Submit jobs; cancel, retry and delete the owner's jobs."""
     ADMIN = "admin"
     """All scopes on all owners' jobs; read the metrics."""
 
@@ -55,14 +55,14 @@ class Token(BaseModel):
     name: str
     scopes: tuple[Scope, ...]
     owner: str
-    """Owner of its jobs: its own id, or that of the token whose jobs it shares."""
+    """Owner of its jobs: its own id, or the owner of the token whose jobs it shares."""
     sha256: str
     """SHA-256 of the complete token, in hex."""
     created_at: datetime
     expires_at: datetime | None = None
     """None: never."""
     max_body_bytes: int | None = None
-    """Largest body of one request; None, here and below: the service's own limit."""
+    """Maximum bytes of a request body; None, here and below: the service's limit."""
     max_queued: int | None = None
     """Maximum number of queued jobs."""
     max_running: int | None = None
@@ -70,16 +70,16 @@ class Token(BaseModel):
     requests_per_minute: int | None = None
 
     def may(self, scope: Scope) -> bool:
-        """Whether the token has a scope."""
+        """Return whether the token has a scope."""
         return scope in self.scopes or Scope.ADMIN in self.scopes
 
     @property
     def sees_all(self) -> bool:
-        """Whether it has access to all owners' jobs."""
+        """Whether the token has access to all owners' jobs."""
         return Scope.ADMIN in self.scopes
 
     def expired(self, now: datetime) -> bool:
-        """Whether it has expired."""
+        """Return whether the token has expired."""
         return self.expires_at is not None and self.expires_at <= now
 
 
@@ -111,15 +111,15 @@ class Tokens:
     ) -> tuple[Token, str]:
         """Create a token; return its record, and the token itself, which is not stored and cannot be shown again.
 
-        Its lifetime is unlimited without `expires`. `sharing` is the id of a token whose jobs the new one shares, e.g. to replace
-        it. `text` is a token that was made elsewhere, e.g. by a deployment; one that is known already stays as it is.
+        `expires` is the lifetime; None: unlimited. `sharing` is the id of a token whose jobs the new one shares, e.g. to replace
+        it. `text` is a token generated elsewhere, e.g. by a deployment; a known one is returned unchanged.
 
         Raises
         ------
         InvalidRequest
-            The name is empty or too long, there is no scope, or the text is no token.
+            The name is empty, too long or not printable, there is no scope, or `text` is not a token.
         UnknownToken
-            There is no token to share jobs with.
+            `sharing` is not the id of a token.
         """
         label = " ".join(name.split())
         if not 1 <= len(label) <= LONGEST_TOKEN_NAME or not label.isprintable():
@@ -147,11 +147,11 @@ class Tokens:
         return token, text
 
     def _checked(self, text: str) -> Token | None:
-        """Return what is kept of a token that was made elsewhere, None if it is new; refuse a text that is none."""
+        """Return the record of a token generated elsewhere, None if it is new; raise InvalidRequest if it is malformed."""
         if _FORM.fullmatch(text) is None:
             raise InvalidRequest(
                 "invalid_token_text", field="from", expected=f"{PREFIX}, 12 hexadecimal digits, _, 43 letters or digits",
-                got=f"{len(text)} characters", hint="`pliant token create` without it makes a token.",
+                got=f"{len(text)} characters", hint="`pliant token create` without it generates a token.",
             )  # fmt: skip
         return self.recognise(text)
 
@@ -173,7 +173,7 @@ class Tokens:
         Raises
         ------
         UnknownToken
-            There is no token of that id.
+            No token has this id.
         """
         with reachable():
             body = self._redis.hget(self._key, id)
@@ -188,7 +188,7 @@ class Tokens:
         return sorted(map(Token.model_validate_json, bodies), key=lambda token: (token.created_at, token.id))
 
     def usable(self) -> bool:
-        """Whether any token has not expired."""
+        """Return whether at least one token has not expired."""
         now = self._clock()
         return any(not token.expired(now) for token in self.all())
 
@@ -198,7 +198,7 @@ class Tokens:
         Raises
         ------
         UnknownToken
-            There is no token of that id.
+            No token has this id.
         """
         token = self.get(id)
         with reachable():

@@ -1,7 +1,7 @@
 """OpenTelemetry traces of a job, from its request through the queue into the stages of the solver. Off by default.
 
-The request's span context is stored in the job's record as a W3C `traceparent`, so the attempt in another process, later and perhaps
-on another host, continues the same trace. Where tracing is off nothing of OpenTelemetry is imported.
+The request's span context is stored in the job's record as a W3C `traceparent`, so that an attempt in another process, perhaps on
+another host, continues the same trace. OpenTelemetry is imported only if tracing is on.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from pliant.worker.errors import InvalidSetting
 logger = logging.getLogger(__name__)
 
 _provider: Any = None
-"""The process's source of spans; None: tracing is off."""
+"""The process's `TracerProvider`; None: tracing is off."""
 
 
 def configure(kind: str, *, service: str) -> None:
-    """Turn tracing on for this process, `service` in traces. Call it after a fork: exporters have threads.
+    """Configure tracing of this process under the name `service`. Call it after a fork, because exporters have threads.
 
     `kind` is `off`; `otlp`, which sends to `OTEL_EXPORTER_OTLP_ENDPOINT` and reads the other `OTEL_…` variables; or `console`.
 
@@ -48,13 +48,13 @@ def configure(kind: str, *, service: str) -> None:
 
 
 def use(provider: Any) -> None:
-    """Take spans from this `TracerProvider`; None turns tracing off."""
+    """Create spans with this `TracerProvider`; None turns tracing off."""
     global _provider
     _provider = provider
 
 
 def finish() -> None:
-    """Send what is left, before the process ends."""
+    """Send the remaining spans and turn tracing off, before the process ends."""
     if _provider is not None:
         _provider.shutdown()
         use(None)
@@ -62,10 +62,9 @@ def finish() -> None:
 
 @contextmanager
 def span(name: str, *, parent: str | None = None, **attributes: str | int | float) -> Iterator[Any]:
-    """Time a block as a span; yield None where tracing is off.
+    """Time a block as a span; yield None if tracing is off.
 
-    `parent` is a `traceparent` to continue; None: the current span of this thread or task. Attributes are written with `pliant.`
-    in front.
+    `parent` is a `traceparent` to continue; None: the current span of this thread or task. Attribute names get the prefix `pliant.`.
     """
     if _provider is None:
         yield None
@@ -77,7 +76,7 @@ def span(name: str, *, parent: str | None = None, **attributes: str | int | floa
 
 
 def past(name: str, *, begin: datetime, end: datetime, **attributes: str | int | float) -> None:
-    """Add a span for something that is over, such as the wait in the queue."""
+    """Add a span for an interval that has ended, such as the wait in the queue."""
     if _provider is not None:
         named = {f"pliant.{key}": value for key, value in attributes.items()}
         tracer = _provider.get_tracer("pliant")
@@ -85,7 +84,7 @@ def past(name: str, *, begin: datetime, end: datetime, **attributes: str | int |
 
 
 def traceparent() -> str | None:
-    """Return the current span as a W3C `traceparent`, None where there is none."""
+    """Return the current span as a W3C `traceparent`, None if there is none."""
     if _provider is None:
         return None
     from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
@@ -103,13 +102,13 @@ class Stages:
         self._span: Any = None
 
     def enter(self, name: str) -> None:
-        """Begin a stage, and end the one before; nothing happens if it is the same."""
+        """End the current stage and begin another; do nothing if it is the same."""
         if _provider is not None and name != self._name:
             self.end()
             self._name, self._span = name, _provider.get_tracer("pliant").start_span(name)
 
     def end(self) -> None:
-        """End the stage."""
+        """End the current stage, if any."""
         if self._span is not None:
             self._span.end()
             self._name = self._span = None

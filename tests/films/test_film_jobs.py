@@ -54,7 +54,7 @@ SIZE = (96, 72)
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A texture that moves to the right, a pixel a frame."""
+    """A texture that moves to the right by one pixel per frame."""
     return films.write_film(tmp_path_factory.mktemp("film") / "film.mkv", films.textured_pictures(10, SIZE))
 
 
@@ -84,7 +84,7 @@ def test_a_film_is_checked_without_being_tracked(film: Path, region: Path) -> No
     assert "96×72 pixels" in stated.notes[0]
 
 
-def test_the_first_frame_of_the_complete_film_is_returned_where_it_is_wanted(film: Path, tmp_path: Path) -> None:
+def test_the_first_frame_of_the_whole_film_is_returned_on_request(film: Path, tmp_path: Path) -> None:
     assert check_film(FilmSource(film), Options()).first_frame == ""
     for frames in ("", "4:10"):
         facts = check_film(FilmSource(film), Options(frames=frames) if frames else Options(), picture=True)
@@ -101,13 +101,13 @@ def test_the_first_frame_of_the_complete_film_is_returned_where_it_is_wanted(fil
     assert (facts.width, facts.height) == (1200, 900)
 
 
-def test_a_first_frame_of_noise_fits_the_answer(tmp_path: Path) -> None:
+def test_an_incompressible_first_frame_fits_the_answer(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (900, 900, 3), dtype=np.uint8)
     pictures = films.zip_of(tmp_path / "noise.zip", {f"{number}.png": films.png(noise) for number in range(3)})
     assert len(check_film(FilmSource(pictures), Options(), picture=True).first_frame) < MAX_ANSWER / 1.5
 
 
-def test_an_installation_sets_the_bounds_of_films(film: Path) -> None:
+def test_film_limits_come_from_the_settings(film: Path) -> None:
     settings = Settings(film_frames=8, film_pixels=5000, film_seconds=2)
     bounds = FilmBounds.of(settings, max_bytes=10**6)
     assert (bounds.max_bytes, bounds.max_frames, bounds.max_pixels, bounds.max_seconds) == (10**6, 8, 5000, 2.0)
@@ -122,7 +122,7 @@ def test_a_portrait_film_is_upright(tmp_path: Path) -> None:
     assert (facts.width, facts.height, facts.frames) == (72, 96, 6)
 
 
-def test_options_that_do_not_fit_the_film_are_rejected_by_name(film: Path, region: Path, tmp_path: Path) -> None:
+def test_options_that_do_not_fit_the_film_are_rejected(film: Path, region: Path, tmp_path: Path) -> None:
     Image.new("L", (10, 10), 255).save(tmp_path / "small.png")
     wrong = refusal(FilmSource(film, tmp_path / "small.png"))
     assert (wrong.code, wrong.field) == ("wrong_region_size", "region")
@@ -147,7 +147,7 @@ def test_too_little_memory_or_time_is_an_input_error(film: Path, tmp_path: Path)
     assert "longest_side" in late.hint
 
 
-def test_every_end_of_the_film_process_has_a_message() -> None:
+def test_each_exit_of_the_film_process_maps_to_an_error() -> None:
     def code_of(code: int, answer: bytes = b"") -> str:
         fault = tracker._fault(Ended(code, answer, ""), FilmBounds(), 1.0)
         assert isinstance(fault, InvalidInput)
@@ -158,7 +158,7 @@ def test_every_end_of_the_film_process_has_a_message() -> None:
     assert code_of(-signal.SIGXCPU) == "too_slow"
     assert code_of(3, b"no JSON") == "damaged_file"
     assert isinstance(tracker._fault(Ended(1, b"", "Traceback"), FilmBounds(), 1.0), RuntimeError)
-    with pytest.raises(InvalidInput, match="confuses its decoder"):
+    with pytest.raises(InvalidInput, match="cannot read consistently"):
         tracker._answer(Tracked, Ended(0, b'{"container": 3}', ""), FilmBounds(), 1.0)
     facts = {
         "container": "mp4",
@@ -172,7 +172,7 @@ def test_every_end_of_the_film_process_has_a_message() -> None:
     }
     for first_frame, believed in (("AAAA", True), ("<svg/>", False)):
         answer = Ended(0, json.dumps({**facts, "pixel_aspect": 1, "first_frame": first_frame}).encode(), "")
-        with nullcontext() if believed else pytest.raises(InvalidInput, match="confuses its decoder"):
+        with nullcontext() if believed else pytest.raises(InvalidInput, match="cannot read consistently"):
             tracker._answer(FilmFacts, answer, FilmBounds(), 1.0)
 
 
@@ -197,7 +197,7 @@ def test_a_film_and_its_region_are_stored_byte_for_byte(film: Path, region: Path
         open_source(films.zip_of(tmp_path / "bad.npz", {"film.json": b"[]"}), tmp_path / "b")
 
 
-def test_films_are_recognised_on_the_command_line(film: Path, tmp_path: Path) -> None:
+def test_films_are_told_apart_from_track_files_and_spreadsheets(film: Path, tmp_path: Path) -> None:
     np.savez(tmp_path / "tracks.npz", tracks=np.zeros(3))
     np.save(tmp_path / "tracks.npy", np.zeros(3))
     (tmp_path / "list.mp4").write_text("#EXTM3U\n")
@@ -253,7 +253,7 @@ def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Pa
     check_film_frames(tmp_path / "out", count=10)
 
 
-def test_the_solve_is_planned_at_the_pace_of_the_machine(
+def test_the_time_estimate_uses_the_measured_machine_pace(
     film: Path, region: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     steps: list[Progress] = []
@@ -269,7 +269,7 @@ def test_the_solve_is_planned_at_the_pace_of_the_machine(
 
 
 def check_followed(steps: list[Progress], folder: Path) -> None:
-    """Points that are reported while tracking runs are those of the finished tracks."""
+    """Check that the points reported during tracking lie on the finished tracks."""
     followed = next(each.followed for each in steps if each.followed is not None)
     assert steps[-1].followed is None
     assert (followed.width, followed.height) == SIZE
@@ -283,7 +283,7 @@ def check_followed(steps: list[Progress], folder: Path) -> None:
 
 
 def check_film_frames(folder: Path, *, count: int) -> None:
-    """film_frames.bin read by the layout that its docstring states: one picture for each tracked frame."""
+    """Read film_frames.bin by the layout in its docstring: one picture per tracked frame."""
     raw = (folder / "film_frames.bin").read_bytes()
     assert raw[:8] == b"PLIANTFF"
     version, length = struct.unpack_from("<II", raw, 8)
@@ -294,12 +294,12 @@ def check_film_frames(folder: Path, *, count: int) -> None:
     assert offsets[-1] == len(raw)
     pictures = [np.asarray(Image.open(io.BytesIO(raw[a:b]))) for a, b in itertools.pairwise(offsets)]
     assert {picture.shape for picture in pictures} == {(SIZE[1], SIZE[0], 3)}
-    # The texture moves to the right, a pixel a frame.
+    # The texture moves to the right by one pixel per frame.
     moved = np.abs(pictures[5][:, 5:].astype(float) - pictures[0][:, :-5]).mean()
     assert moved < 0.5 * np.abs(pictures[5].astype(float) - pictures[0]).mean()
 
 
-def test_large_pictures_are_reduced_and_long_films_have_no_film_frames(
+def test_pictures_are_reduced_and_incomplete_or_large_strips_not_written(
     film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wide = np.zeros((300, 960, 3), np.uint8)
@@ -343,7 +343,7 @@ def tracks_file(path: Path, **more: np.ndarray) -> Path:
     return path
 
 
-def test_confidence_of_the_tracker_is_the_weight(tmp_path: Path) -> None:
+def test_tracker_confidence_becomes_the_observation_weight(tmp_path: Path) -> None:
     seen = np.ones((4, 9), bool)
     seen[1, 3] = False
     tracked = Tracked(container="mp4", warnings=("Only 4 frames.",))
@@ -377,7 +377,7 @@ def test_the_film_process_has_no_network_and_starts_no_programs() -> None:
     """)
     ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert ran.stdout.split() == ["True", str(errno.EACCES), str(errno.EACCES), "thread"]
-    socket.socket().close()  # here it still works
+    socket.socket().close()  # this process is not restricted
 
 
 def test_an_unknown_architecture_has_no_network_filter(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -399,12 +399,12 @@ def test_progress_is_passed_on_and_invalid_lines_dropped() -> None:
 @pytest.mark.parametrize(
     "stated", [None, [30], [30, 0], [30, -1], [30, 1.5], [30, 1 << 30], ["30", "900"], {"frames": 30}]
 )
-def test_only_plausible_sizes_are_believed(stated: object) -> None:
+def test_implausible_stated_sizes_are_ignored(stated: object) -> None:
     assert believed_size(stated) is None
     assert believed_size([30, 900]) == (30, 900)
 
 
-def test_the_plan_of_a_film_includes_the_search_for_an_isometric_surface() -> None:
+def test_the_time_estimate_includes_the_isometric_surface_search() -> None:
     free, auto = (solving_seconds(30, 900, Options(surface=surface)) for surface in ("free", "auto"))
     assert 1 < free < auto
     assert solving_seconds(60, 900, Options(surface="free")) > free

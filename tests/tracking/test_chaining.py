@@ -1,4 +1,4 @@
-"""The first round: tracks from flow, frame by frame."""
+"""The first pass: tracks from optical flow, frame by frame."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def texture(size: tuple[int, int], seed: int) -> np.ndarray:
 
 
 def followed(speed: float, *, template: int = 0, hidden: range = range(0)) -> tuple[Chain, np.ndarray, list[int]]:
-    """Follow a square of texture that moves to the right at `speed` pixels a frame, and return the true paths and the frames in order.
+    """Track a textured square that moves right at `speed` pixels per frame; return tracks, true paths and the order of the frames.
 
-    In the frames `hidden` another texture covers its left half.
+    In the frames `hidden`, another texture covers its left half.
     """
     width = 304 + round(speed * FRAMES)
     behind, thing, cover = texture((width, 304), 0), texture((240, 240), 1), texture((120, 240), 2)
@@ -53,20 +53,20 @@ def followed(speed: float, *, template: int = 0, hidden: range = range(0)) -> tu
     return result, seeds.points + moved[:, None].astype(np.float32), order
 
 
-def test_both_ends_are_reached_from_the_template() -> None:
+def test_tracking_runs_from_the_template_to_both_ends() -> None:
     result, true, order = followed(2, template=3)
     assert order == [4, 5, 6, 7, 2, 1, 0]
     assert result.visible.mean() > 0.97
     assert np.linalg.norm(result.points - true, axis=2)[result.visible].max() < 0.5
 
 
-def test_flow_covers_what_moves_on_while_it_is_computed() -> None:
+def test_points_moving_26_pixels_per_frame_are_tracked() -> None:
     result, true, _ = followed(26)
     assert result.visible[2:].mean() > 0.9
     assert np.median(np.linalg.norm(result.points - true, axis=2)[2:]) < 0.1
 
 
-def test_points_that_were_hidden_are_seen_again() -> None:
+def test_points_are_recovered_after_an_occlusion() -> None:
     result, true, _ = followed(1, hidden=range(3, 5))
     left = true[0, :, 0] < 32 + 112
     assert result.visible[3:5, left].mean() < 0.1
@@ -74,7 +74,7 @@ def test_points_that_were_hidden_are_seen_again() -> None:
     assert np.percentile(np.linalg.norm(result.points - true, axis=2)[5:, left], 90) < 0.3
 
 
-def test_places_outside_the_template_keep_their_confidence_where_most_are_in_it() -> None:
+def test_confidence_ignores_the_template_if_most_observations_are_in_it() -> None:
     visible, variance = np.zeros((4, 10), bool), np.full((4, 10), 0.04, np.float32)
     visible[0], visible[1:, :3], variance[0] = True, True, 0.0
     variance[1, 0] = 0.4

@@ -49,7 +49,7 @@ def test_pictures_of_a_folder_and_a_zip_come_in_natural_order(tmp_path: Path) ->
         np.testing.assert_array_equal(read(film), np.stack(PICTURES))
 
 
-def test_a_gif_keeps_its_uneven_times(tmp_path: Path) -> None:
+def test_gif_frame_durations_are_kept(tmp_path: Path) -> None:
     first, *others = [Image.fromarray(picture).quantize(64) for picture in PICTURES]
     first.save(tmp_path / "film.gif", save_all=True, append_images=others, duration=[40, 40, 200, 40, 40, 40, 40, 40])
     frames = list(open_film(tmp_path / "film.gif").frames())
@@ -68,7 +68,7 @@ def test_a_rotation_flag_is_applied(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(turned), np.rot90(upright, -1, axes=(1, 2)))
 
 
-def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
+def test_exif_orientation_is_applied(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6
     for number, picture in enumerate(PICTURES[:3]):
@@ -95,13 +95,13 @@ def test_variable_rate_gives_the_true_times(tmp_path: Path) -> None:
         ("3", [0, 3, 6]),
     ],
 )
-def test_frames_select(tmp_path: Path, frames: int | slice | str | None, indices: range | list[int]) -> None:
+def test_frames_can_be_selected(tmp_path: Path, frames: int | slice | str | None, indices: range | list[int]) -> None:
     film = open_film(films.write_film(tmp_path / "film.avi", PICTURES), frames=frames)
     assert [frame.index for frame in film.frames()] == list(indices)
 
 
 @pytest.mark.parametrize("frames", [0, -1, True, "a", "5:2", "::0", "-3:", "1:2:3:4", ""])
-def test_a_wrong_selection_is_refused(tmp_path: Path, frames: int | str) -> None:
+def test_invalid_frame_selections_are_rejected(tmp_path: Path, frames: int | str) -> None:
     path = films.write_film(tmp_path / "film.avi", PICTURES)
     with pytest.raises(FilmError, match="start:stop:step") as caught:
         open_film(path, frames=frames)
@@ -118,7 +118,7 @@ def test_a_wrong_selection_is_refused(tmp_path: Path, frames: int | str) -> None
     ],
 )
 @pytest.mark.parametrize("kind", ["mkv", "zip"])
-def test_limits(tmp_path: Path, limits: FilmLimits, code: str, kind: str) -> None:
+def test_films_over_a_limit_are_rejected(tmp_path: Path, limits: FilmLimits, code: str, kind: str) -> None:
     if kind == "mkv":
         path = films.write_film(tmp_path / "film.mkv", PICTURES)
     else:
@@ -157,7 +157,7 @@ def test_a_zip_with_a_broken_deflate_stream_is_refused(tmp_path: Path) -> None:
     assert caught.value.code == "broken_picture"
 
 
-def test_memory_that_zlib_lacks_is_no_fault_of_the_picture() -> None:
+def test_zlib_running_out_of_memory_raises_memory_error() -> None:
     with pytest.raises(MemoryError, match="Error -4"), readable("1.png"):
         raise zlib.error("Error -4 while decompressing data")
 
@@ -170,7 +170,7 @@ def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
     assert caught.value.code == "too_many_bytes"
 
 
-def test_a_picture_bomb_is_refused_by_its_header(tmp_path: Path) -> None:
+def test_a_decompression_bomb_in_a_picture_is_refused(tmp_path: Path) -> None:
     flat = Image.new("1", (10_000, 10_000))
     flat.save(tmp_path / "1.png")
     path = films.zip_of(tmp_path / "film.zip", {"1.png": (tmp_path / "1.png").read_bytes()})
@@ -187,11 +187,11 @@ def test_a_zip_with_an_immense_directory_is_refused(tmp_path: Path) -> None:
 
 
 def with_displayed_width(path: Path, width: int) -> Path:
-    """Set the width that an MP4 film is displayed with: FFmpeg takes the ratio to the stored one for the shape of a pixel."""
+    """Set an MP4 film's display width; FFmpeg takes its ratio to the stored width as the pixel aspect."""
     return films.patched(path, b"tkhd", 80, struct.pack(">I", width << 16))
 
 
-def test_pixels_that_are_not_square_are_stretched(tmp_path: Path) -> None:
+def test_non_square_pixels_are_stretched_to_square(tmp_path: Path) -> None:
     path = films.write_film(tmp_path / "film.mp4", PICTURES)
     plain = read(open_film(path))
     wide = open_film(with_displayed_width(path, 96))
@@ -205,7 +205,7 @@ def test_pixels_that_are_not_square_are_stretched(tmp_path: Path) -> None:
     assert read(turned).shape == (8, 96, 48, 3)
 
 
-def test_absurd_pixels_are_refused(tmp_path: Path) -> None:
+def test_extreme_pixel_aspect_ratios_are_refused(tmp_path: Path) -> None:
     path = with_displayed_width(films.write_film(tmp_path / "film.mp4", PICTURES), 640)
     with pytest.raises(FilmError, match="setsar=1") as caught:
         open_film(path)

@@ -1,4 +1,4 @@
-"""What tracking a film would take."""
+"""The estimate of points and time for tracking a film."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SIZE = (96, 72)
 
 
 def taken(path: Path, region: np.ndarray | None = None, *, frames: str | None = None, threads: int = 1) -> Estimate:
-    """Estimate what tracking a film would take, every 3 pixels."""
+    """Estimate tracking a film with a grid step of 3 pixels."""
     opened = open_film(path, frames=frames)
     return estimate(opened, region=region, region_frame=0, grid_step=3, longest_side=960, threads=threads)
 
@@ -29,7 +29,7 @@ def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return films.write_film(tmp_path_factory.mktemp("films") / "film.mkv", pictures)
 
 
-def test_points_are_those_that_tracking_begins_with(film: Path) -> None:
+def test_estimated_points_equal_the_tracked_points(film: Path) -> None:
     region = np.zeros(SIZE[::-1], bool)
     region[12:60, 9:51] = True
     tracked = track_film(film, region=region, grid_step=3, frames=":4")
@@ -37,9 +37,7 @@ def test_points_are_those_that_tracking_begins_with(film: Path) -> None:
     assert taken(film).points > 1.2 * taken(film, region).points
 
 
-def test_time_is_that_of_one_frame_for_every_frame_shared_by_the_threads(
-    film: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_estimated_time_scales_with_frames_and_threads(film: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert taken(film).seconds > 0
     clock = itertools.count()
     monkeypatch.setattr(tracking_estimate.time, "perf_counter", lambda: float(next(clock)))
@@ -49,7 +47,7 @@ def test_time_is_that_of_one_frame_for_every_frame_shared_by_the_threads(
     assert taken(film, threads=8).seconds == 40 * frame / 8
 
 
-def test_without_texture_there_is_nothing_to_track(film: Path) -> None:
+def test_a_region_without_texture_is_estimated_at_zero_points(film: Path) -> None:
     region = np.zeros(SIZE[::-1], bool)
     region[12:60, 66:90] = True
     assert taken(film, region) == Estimate(0, 0.0)

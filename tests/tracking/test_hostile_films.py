@@ -42,13 +42,13 @@ def test_playlists_are_refused_whatever_their_name(tmp_path: Path, suffix: str, 
 @pytest.mark.parametrize(
     "data", [b"DISPLAY=AviSource('x.avi')", b"\x89PNG\r\n\x1a\n", b"\0" * 100, b"%PDF-1.7", b"\x1aE\xdf\xa3 other"]
 )
-def test_other_files_are_refused(tmp_path: Path, data: bytes) -> None:
+def test_files_that_are_not_films_are_refused(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "film.mp4"
     path.write_bytes(data)
     assert refused(path) == "unsupported_film"
 
 
-def test_missing_and_empty_files(tmp_path: Path) -> None:
+def test_missing_and_empty_files_are_refused(tmp_path: Path) -> None:
     assert refused(tmp_path / "none.mp4") == "unreadable_film"
     (tmp_path / "film.mp4").write_bytes(b"")
     assert refused(tmp_path / "film.mp4") == "empty_film"
@@ -56,7 +56,7 @@ def test_missing_and_empty_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["%03d.mp4", "http:film.mp4", "concat:a|b.mp4", "pipe:0"])
-def test_a_file_name_is_never_interpreted(tmp_path: Path, name: str) -> None:
+def test_file_names_are_not_interpreted_as_patterns_or_urls(tmp_path: Path, name: str) -> None:
     films.write_film(tmp_path / "plain.mp4", PICTURES).rename(tmp_path / name)
     assert len(list(open_film(tmp_path / name).frames())) == 12
 
@@ -70,7 +70,7 @@ def test_samples_in_another_file_are_refused(tmp_path: Path) -> None:
     assert refused(path) == "external_reference"
 
 
-def test_data_references_are_read_with_care(tmp_path: Path) -> None:
+def test_miscounted_data_references_are_refused(tmp_path: Path) -> None:
     def film(dref: bytes) -> Path:
         path = tmp_path / "film.mp4"
         minf = films.box(b"minf", films.box(b"dinf", films.box(b"dref", dref)))
@@ -88,7 +88,7 @@ def test_a_reference_movie_is_refused(tmp_path: Path) -> None:
     assert refused(tmp_path / "film.mov") == "external_reference"
 
 
-def test_sound_alone_is_refused(tmp_path: Path) -> None:
+def test_a_film_without_a_picture_track_is_refused(tmp_path: Path) -> None:
     path = films.write_film(tmp_path / "film.mp4", PICTURES)
     assert refused(films.patched(path, b"hdlr", 12, b"soun")) == "no_picture"
     with pytest.raises(FilmError) as caught:
@@ -111,7 +111,7 @@ def test_thousands_of_boxes_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.95])
-def test_a_film_without_its_index_is_refused(tmp_path: Path, share: float) -> None:
+def test_truncated_films_are_refused(tmp_path: Path, share: float) -> None:
     path = films.write_film(tmp_path / "film.mp4", PICTURES)
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
     assert refused(path) in ("truncated_film", "no_picture", "undecodable_film")
@@ -133,14 +133,14 @@ def test_immense_dimensions_are_refused(tmp_path: Path) -> None:
     assert refused(path) in ("too_many_pixels", "undecodable_film")
 
 
-def test_dimensions_of_the_container_alone_decide_nothing(tmp_path: Path) -> None:
+def test_wrong_container_dimensions_are_ignored(tmp_path: Path) -> None:
     path = films.patched(
         films.write_film(tmp_path / "film.avi", PICTURES), b"strf", 12, struct.pack("<ii", 60_000, 60_000)
     )
     assert open_film(path).size == (64, 48)
 
 
-def test_a_film_of_random_bytes_is_rejected(tmp_path: Path) -> None:
+def test_a_film_header_followed_by_zeros_is_refused(tmp_path: Path) -> None:
     path = films.write_film(tmp_path / "film.mkv", PICTURES)
     path.write_bytes(path.read_bytes()[:64] + bytes(1000))
     assert refused(path) == "undecodable_film"

@@ -1,4 +1,4 @@
-"""Memory of the tracker against the length of the film."""
+"""Memory of the tracker as a function of the film's length."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BYTES = 2 * 4 + 4 + 4 + 1
 """For each frame and point: tracks, confidence and variance in single precision, and visibility."""
 
 SLACK = 1 << 20
-"""The allocator's rounding. The 90 frames more, kept as grey pictures, would take 1.7 MB: more than is allowed here."""
+"""Allocator rounding. Keeping the 90 additional frames as grey pictures would take 1.7 MB, more than this."""
 
 
 def swaying(frames: int) -> list[np.ndarray]:
@@ -48,7 +48,7 @@ def measured(film: Path, frames: int) -> dict[str, float]:
     return answer
 
 
-def test_only_the_tracks_grow_with_the_film(tmp_path: Path) -> None:
+def test_memory_grows_with_the_film_only_by_its_tracks(tmp_path: Path) -> None:
     film = films.write_film(tmp_path / "film.mkv", swaying(120))
     short, long = measured(film, 30), measured(film, 120)
     assert (short["frames"], long["frames"]) == (30, 120)

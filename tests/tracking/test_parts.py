@@ -1,4 +1,4 @@
-"""Inputs of users become files for the service; invalid ones are rejected locally."""
+"""The parts of the tracker: regions, cuts, flow, seeding, registration and rendered films."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ def grey(count: int = 2, step: int = 2) -> list[np.ndarray]:
     return [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY) for p in films.textured_pictures(count, (96, 72), step=step)]
 
 
-def test_without_opencv_the_import_says_what_to_install() -> None:
+def test_importing_without_opencv_names_the_extra_to_install() -> None:
     code = "import sys; sys.modules['cv2'] = None\nimport pliant.tracking"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert ran.returncode != 0
     assert "pip install 'pliant[film]'" in ran.stderr
 
 
-def test_nothing_else_imports_opencv() -> None:
+def test_pliant_and_its_solver_do_not_import_opencv() -> None:
     code = "import sys, pliant, pliant.solver, pliant.solver.gallery; sys.exit('cv2' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_regions(tmp_path: Path) -> None:
+def test_regions_are_read_from_masks_polygons_and_files(tmp_path: Path) -> None:
     mask = np.zeros((48, 64), bool)
     mask[10:30, 20:41] = True
     np.testing.assert_array_equal(read_region(mask, (64, 48)), mask)
@@ -73,13 +73,13 @@ def test_wrong_regions_are_refused(region: object, code: str) -> None:
     assert (caught.value.code, caught.value.field) == (code, "region")
 
 
-def test_a_mask_of_another_size_is_not_decoded(tmp_path: Path) -> None:
+def test_a_mask_file_of_another_size_is_refused(tmp_path: Path) -> None:
     Image.new("L", (100, 80), 255).save(tmp_path / "mask.png")
     with pytest.raises(FilmError, match="got 100×80"):
         read_region(tmp_path / "mask.png", (64, 48))
 
 
-def test_cuts_are_single_steps() -> None:
+def test_a_single_drop_in_similarity_is_a_cut_and_fast_motion_is_not() -> None:
     likeness = np.full(30, 0.95)
     assert find_cuts(likeness) == ()
     likeness[12] = 0.1
@@ -148,7 +148,7 @@ def test_grids_lose_points_without_a_face_and_keep_their_order() -> None:
     rows, columns = seeds.grid.shape
     assert len(quads(seeds.grid)) == (rows - 1) * (columns - 1)
     wanted = np.ones(len(seeds.points), bool)
-    wanted[seeds.grid[0, 1]] = False  # the corner beside it loses its only face
+    wanted[seeds.grid[0, 1]] = False  # the corner next to it loses its only face
     grid, kept = keep(seeds.grid, wanted)
     gone = set(range(len(seeds.points))) - set(kept.tolist())
     assert gone == {int(seeds.grid[0, 0]), int(seeds.grid[0, 1])}
@@ -171,7 +171,7 @@ def test_names_sort_by_their_numbers() -> None:
     assert sorted(["b2", "a10", "a9", "a", "B1"], key=natural) == ["a", "a9", "a10", "B1", "b2"]
 
 
-def test_a_rendered_film_shows_what_its_truth_states() -> None:
+def test_a_rendered_film_agrees_with_its_ground_truth() -> None:
     film = render_film(sphere(4, 400, degrees=10), size=(96, 72), noise=0.0)
     row, column = np.nonzero(cv2.erode(film.region(0).astype(np.uint8), np.ones((15, 15))))
     points = np.stack([column, row], axis=1).astype(float)
@@ -200,7 +200,7 @@ def test_rendered_films_are_written_in_known_containers_only(tmp_path: Path) -> 
 
 
 def registered() -> tuple[Registration, np.ndarray, np.ndarray, np.ndarray]:
-    """A template's grid, a frame that shows it turned in another light, true places there, and the end of a flow."""
+    """Return a template's registration, a frame of it rotated under other light, the true positions there, and noisy flow."""
     wide = cv2.cvtColor(films.textured_pictures(1, (96, 72))[0], cv2.COLOR_RGB2GRAY)
     turn = cv2.getRotationMatrix2D((48, 36), 6, 1.05)
     frame = np.asarray(cv2.warpAffine(wide, turn, (96, 72), flags=cv2.INTER_CUBIC), np.uint8)
@@ -211,7 +211,7 @@ def registered() -> tuple[Registration, np.ndarray, np.ndarray, np.ndarray]:
     return Registration.of(wide, seeds.points, seeds.grid, noise=noise_variance(wide)), frame, true, flowed
 
 
-def test_registration_finds_the_point_that_the_flow_missed() -> None:
+def test_registration_corrects_the_error_of_the_flow() -> None:
     registration, frame, true, flowed = registered()
     visible, before = np.ones(len(true), bool), np.full(len(true), 0.5, np.float32)
     found, variance = registration.refine(frame, flowed, before, visible)
@@ -226,7 +226,7 @@ def test_registration_finds_the_point_that_the_flow_missed() -> None:
     np.testing.assert_array_equal(same, before)
 
 
-def test_registration_leaves_alone_what_shows_something_else() -> None:
+def test_registration_leaves_points_on_unrelated_pictures_unchanged() -> None:
     registration, _, true, flowed = registered()
     other = cv2.cvtColor(films.textured_pictures(1, (96, 72), seed=5)[0], cv2.COLOR_RGB2GRAY)
     visible, before = np.ones(len(true), bool), np.full(len(true), 0.5, np.float32)
@@ -245,7 +245,7 @@ def test_registration_of_a_frame_with_itself_moves_nothing() -> None:
     assert variance.max() < 0.01
 
 
-def test_a_cell_moves_bilinearly_and_a_plane_does_not_bend() -> None:
+def test_cells_interpolate_bilinearly_and_affine_motion_has_no_bending() -> None:
     registration, *_ = registered()
     cells, count = registration.cells, len(registration.points)
     corner = registration.points[cells.corners]
@@ -270,7 +270,7 @@ def test_a_cell_moves_bilinearly_and_a_plane_does_not_bend() -> None:
     np.testing.assert_allclose(cells.normal(weight, slopes).toarray(), expected, atol=1e-4)
 
 
-def test_the_error_of_a_film_is_that_of_every_frame_after_one_scale() -> None:
+def test_shape_error_is_the_frame_error_after_one_scale_per_film() -> None:
     rng = np.random.default_rng(0)
     true, on = rng.normal(size=(4, 6, 3)), np.array([True, False, True, True, True, True, False, True])
     truth = Truth(on, true[..., :2], np.ones((4, 6), dtype=bool), true)

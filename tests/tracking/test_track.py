@@ -54,7 +54,7 @@ def test_tracks_agree_with_the_truth(tmp_path: Path, name: str) -> None:
     assert result["precision"] >= 0.97, result
     assert result["recall"] >= 0.8, result
     assert tracked.template == start
-    # Confidence says something: the surer half of the visible points is the more accurate.
+    # Confidence is informative: the more confident half of the visible points is more accurate.
     true, seen, _ = film.follow(tracked.tracks[start].astype(float), start)
     right = tracked.visibility & seen & np.isfinite(true).all(axis=2)
     right[start] = False
@@ -114,7 +114,7 @@ def test_the_result_does_not_depend_on_threads(turning: tuple[Path, RenderedFilm
     assert cv2.getNumThreads() == before
 
 
-def test_a_region_is_carried_to_another_template(turning: tuple[Path, RenderedFilm]) -> None:
+def test_a_region_is_transferred_to_another_template_frame(turning: tuple[Path, RenderedFilm]) -> None:
     path, film = turning
     steps: list[TrackingStep] = []
     tracked = track_film(path, region=film.region(0), template_frame=9, grid_step=3, on_step=steps.append)
@@ -151,7 +151,7 @@ def test_tracking_stops_at_every_stage(turning: tuple[Path, RenderedFilm], stage
     assert [step.stage for step in steps].count(stage) == 1, "nothing more happens after the request"
 
 
-def test_pictures_are_not_read_again_after_a_stop(turning: tuple[Path, RenderedFilm]) -> None:
+def test_tracking_stops_between_its_two_passes(turning: tuple[Path, RenderedFilm]) -> None:
     path, film = turning
     last = threading.Event()
 
@@ -163,7 +163,7 @@ def test_pictures_are_not_read_again_after_a_stop(turning: tuple[Path, RenderedF
         track_film(path, region=film.region(8), region_frame=8, on_step=on_step, should_stop=last.is_set)
 
 
-def test_without_a_region_everything_in_a_busy_film_is_tracked_with_a_warning(tmp_path: Path) -> None:
+def test_without_a_region_the_whole_picture_is_tracked_with_a_warning(tmp_path: Path) -> None:
     behind, before = (films.textured_pictures(8, (96, 72), seed=seed) for seed in (0, 7))
     for number, (picture, thing) in enumerate(zip(behind, before, strict=True)):
         picture[20 + number : 50 + number, 30:70] = thing[20:50, 30:70]  # moves down, the background to the right
@@ -259,7 +259,7 @@ def test_a_region_lost_before_the_template_is_rejected(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_uneven_times_and_a_broken_tail_get_warnings(tmp_path: Path) -> None:
+def test_uneven_frame_times_and_a_damaged_end_give_warnings(tmp_path: Path) -> None:
     pictures = films.textured_pictures(24, (96, 72))
     path = films.with_uneven_times(films.write_film(tmp_path / "film.mp4", pictures), first=12)
     region = [(20, 20), (60, 20), (60, 50), (20, 50)]
@@ -272,7 +272,7 @@ def test_uneven_times_and_a_broken_tail_get_warnings(tmp_path: Path) -> None:
     assert any("its end is damaged or missing" in note for note in tracked.warnings)
 
 
-def test_large_films_are_reduced_and_tracks_stay_in_their_pixels(tmp_path: Path) -> None:
+def test_tracks_of_reduced_films_are_in_the_original_pixels(tmp_path: Path) -> None:
     pictures = [cv2.resize(p, (768, 576), interpolation=cv2.INTER_CUBIC) for p in films.textured_pictures(6, (96, 72))]
     path = films.write_film(tmp_path / "film.mkv", pictures)
     tracked = track_film(path, region=[(200, 150), (500, 150), (500, 400), (200, 400)], longest_side=192)

@@ -1,4 +1,4 @@
-"""Tracking once more from the paths of all points."""
+"""The second pass: tracking again from the expected paths of all points."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def turning(points: np.ndarray) -> np.ndarray:
     return np.stack([across, np.broadcast_to(points[:, 1], across.shape)], axis=2).astype(np.float32)
 
 
-def test_expected_places_overrule_uncertain_ones_and_fill_hidden_ones() -> None:
+def test_expected_positions_correct_uncertain_and_fill_hidden_ones() -> None:
     points = np.random.default_rng(0).uniform(20, 140, (200, 2)).astype(np.float32)
     true = turning(points)
     tracked, variance, visible = true.copy(), np.full((FRAMES, 200), 0.01, np.float32), np.ones((FRAMES, 200), bool)
@@ -39,14 +39,14 @@ def test_expected_places_overrule_uncertain_ones_and_fill_hidden_ones() -> None:
     assert np.median(error) < 0.02
 
 
-def test_a_stop_is_heeded_between_parts_of_the_points() -> None:
+def test_computing_expected_positions_can_be_stopped() -> None:
     points = turning(np.random.default_rng(0).uniform(20, 140, (60, 2)).astype(np.float32))
     chained = Chain(points, np.ones((FRAMES, 60), bool), np.full((FRAMES, 60), 0.01, np.float32))
     with pytest.raises(TrackingStopped):
         move_to_expected(chained, lambda: True)
 
 
-def test_expected_places_take_the_memory_of_the_tracks() -> None:
+def test_memory_for_expected_positions_is_proportional_to_the_tracks() -> None:
     frames, count = 300, 4000
     drift = np.arange(frames, dtype=np.float32)[:, None, None] * np.float32([0.1, 0.05])
     points = np.random.default_rng(0).uniform(0, 300, (count, 2)).astype(np.float32) + drift
@@ -62,7 +62,7 @@ def test_expected_places_take_the_memory_of_the_tracks() -> None:
 
 
 def film() -> tuple[np.ndarray, np.ndarray, Appearance, Registration]:
-    """Return frames of a texture that drifts, the true paths, and what a tracker compares with the first frame."""
+    """Return frames of a drifting texture, the true paths, and the appearance and registration of the first frame."""
     cv2 = pytest.importorskip("cv2")
     noise = np.random.default_rng(1).standard_normal((120, 160)).astype(np.float32)
     texture = cv2.GaussianBlur(noise, (0, 0), 2.0)
@@ -81,7 +81,7 @@ def film() -> tuple[np.ndarray, np.ndarray, Appearance, Registration]:
 
 
 def again(chained: Chain, *, stop: bool = False) -> tuple[Chain, np.ndarray, list[int]]:
-    """Track the film again from given tracks; return them, the true paths, and the frames that were reported."""
+    """Track the film again from given tracks; return the tracks, the true paths and the reported frames."""
     grey, true, appearance, registration = film()
     seen: list[int] = []
     with ThreadPoolExecutor(2) as pool:
@@ -93,7 +93,7 @@ def again(chained: Chain, *, stop: bool = False) -> tuple[Chain, np.ndarray, lis
 
 
 def spoiled() -> Chain:
-    """Return tracks of the film of which some lost their way, and some were lost."""
+    """Return tracks of the film, some of them wrong and some lost."""
     true = film()[1]
     variance = np.full(true.shape[:2], 0.01, np.float32)
     points, visible = true.copy(), np.ones(true.shape[:2], bool)
@@ -103,7 +103,7 @@ def spoiled() -> Chain:
     return Chain(points, visible, variance)
 
 
-def test_lost_points_are_found_again_and_wrong_ones_put_right() -> None:
+def test_the_second_pass_recovers_lost_points_and_corrects_wrong_ones() -> None:
     result, true, seen = again(spoiled())
     error = np.linalg.norm(result.points - true, axis=2)
     assert error[6:9, 60:90].max() < 0.3
@@ -112,6 +112,6 @@ def test_lost_points_are_found_again_and_wrong_ones_put_right() -> None:
     assert seen == list(range(1, FRAMES))
 
 
-def test_a_stop_ends_the_second_round() -> None:
+def test_the_second_pass_can_be_stopped() -> None:
     with pytest.raises(TrackingStopped):
         again(spoiled(), stop=True)

@@ -1,4 +1,4 @@
-"""The exact words of every refusal of a film, a region and the choice of frames, as a user sees them."""
+"""The exact error messages for films, regions and frame selections, as a user sees them."""
 
 # ruff: noqa: E501
 from __future__ import annotations
@@ -24,7 +24,7 @@ ODD = [(64, 48), (64, 48), (32, 48)]
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A file, what it is opened with, and the sentence of its refusal; with `track` it is also tracked."""
+    """A file, the arguments it is opened with, and the expected message; with `track` it is also tracked."""
 
     name: str = "film.mp4"
     data: bytes | Callable[[Path], object] = b""
@@ -55,7 +55,7 @@ def elsewhere(path: Path) -> None:
 def broken_deflate(path: Path) -> None:
     films.zip_of(path, {"1.png": bytes(2000)})
     data = bytearray(path.read_bytes())
-    data[35:39] = b"\xff" * 4  # behind the local header
+    data[35:39] = b"\xff" * 4  # after the local header
     path.write_bytes(data)
 
 
@@ -147,9 +147,9 @@ CASES: dict[str, Case] = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_words_of_a_refusal(name: str, tmp_path: Path) -> None:
+def test_each_invalid_film_gets_its_exact_error_message(name: str, tmp_path: Path) -> None:
     case = CASES[name]
     words = str(refused(case, tmp_path))
-    if "…" in case.words:  # in the words of a library
+    if "…" in case.words:  # this part comes from a library
         words = re.sub(r"\.(png|py): .+\. Save", r".\1: …. Save", words)
     assert words == case.words

@@ -35,7 +35,7 @@ def valkey_data(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture
 def settings(valkey_data: Path, tmp_path: Path) -> Settings:
-    """Settings on the session's Valkey, with blobs and keys of the test's own."""
+    """Settings on the session's Valkey, with separate blobs and keys for each test."""
     return Settings(
         data=tmp_path, redis_url=Settings(data=valkey_data).redis, queue=f"test-{secrets.token_hex(4)}", lost_after=2.0
     )
@@ -43,7 +43,7 @@ def settings(valkey_data: Path, tmp_path: Path) -> Settings:
 
 @pytest.fixture(params=["redis", "memory"])
 def jobs(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Jobs]:
-    """The whole door, on the real stores and on their doubles."""
+    """The job operations, on the real stores and on their in-memory doubles."""
     if request.param == "memory":
         yield Jobs(
             records=MemoryRecords(),
@@ -101,7 +101,7 @@ def submit(jobs: Jobs, inputs_file: Path, options: Options, interpretation: Inte
 
 @pytest.fixture(scope="session")
 def inputs_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Canonical inputs of a job of a moment and of one that is only ever ended from outside."""
+    """Canonical inputs of a short job, and of a long one that the tests have to stop."""
     folder = tmp_path_factory.mktemp("inputs")
     make_inputs(folder / "short.npz", frames=6, points=40)
     make_long_inputs(folder / "long.npz")
@@ -110,7 +110,7 @@ def inputs_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of three megabytes."""
+    """A file system of 3 MB."""
     disk = tmp_path / "small"
     disk.mkdir()
     made = subprocess.run(

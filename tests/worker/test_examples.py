@@ -34,14 +34,14 @@ def test_every_example_is_read_as_described(name: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(inputs.ground_truth.shapes, made.shapes, atol=1e-4)
 
 
-def test_the_same_bytes_every_time() -> None:
+def test_an_example_file_has_the_same_bytes_every_time() -> None:
     assert example_file("flag", "tracks.npz") == example_file("flag", "tracks.npz")
 
 
 @pytest.mark.parametrize(
     ("name", "file"), [("absent", "tracks.npz"), ("face", "absent.npz"), ("face", "../tracks.npz")]
 )
-def test_an_unknown_example_names_those_there_are(name: str, file: str) -> None:
+def test_the_error_for_an_unknown_example_lists_the_known_ones(name: str, file: str) -> None:
     with pytest.raises(UnknownExample, match=r"There are: face/tracks\.npz, face/mesh\.npz"):
         example_file(name, file)
 

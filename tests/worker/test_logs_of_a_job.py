@@ -1,4 +1,4 @@
-"""The lines of one job, over API, worker and job process, are found by its id."""
+"""Log lines of one job from API, worker and job process can be found by its id."""
 
 from __future__ import annotations
 

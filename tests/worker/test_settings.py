@@ -54,7 +54,7 @@ def test_the_environment_round_trips(set_variables: Callable[..., None]) -> None
         ("RETENTION", "inf"), ("LOST_AFTER", "0.5"), ("DISK_QUOTA", "1.5"),
     ],
 )  # fmt: skip
-def test_a_wrong_value_names_the_variable_and_both_sides(
+def test_errors_name_the_variable_the_expected_and_the_given_value(
     set_variables: Callable[..., None], name: str, text: str
 ) -> None:
     set_variables(**{name: text})
@@ -63,7 +63,7 @@ def test_a_wrong_value_names_the_variable_and_both_sides(
     assert (caught.value.code, caught.value.field) == ("invalid_setting", f"PLIANT_{name}")
 
 
-def test_networks_are_networks(set_variables: Callable[..., None]) -> None:
+def test_webhook_networks_are_validated_and_normalised(set_variables: Callable[..., None]) -> None:
     set_variables(WEBHOOK_NETWORKS=" 10.0.0.0/8, ::1 ,")
     assert Settings.from_environment().webhook_networks == "10.0.0.0/8,::1/128"
     for wrong in ("10.0.0.1/8", "localhost", "10/8/8"):
@@ -72,7 +72,7 @@ def test_networks_are_networks(set_variables: Callable[..., None]) -> None:
             Settings.from_environment()
 
 
-def test_environment_env_file_and_secret_files_in_this_order(
+def test_environment_overrides_env_file_which_overrides_secret_files(
     set_variables: Callable[..., None], tmp_path: Path
 ) -> None:
     (tmp_path / ".env").write_text("PLIANT_WORKERS=2\nPLIANT_QUEUE=filed\nPLIANT_PORT=7000\nOTHER=1\nPLIANT_DATA=\n")
@@ -88,13 +88,13 @@ def test_environment_env_file_and_secret_files_in_this_order(
     assert ServiceSettings.from_environment().port == 7000
 
 
-def test_a_folder_of_secrets_that_is_named_exists(set_variables: Callable[..., None], tmp_path: Path) -> None:
+def test_a_missing_secrets_folder_is_an_error(set_variables: Callable[..., None], tmp_path: Path) -> None:
     set_variables(SECRETS_DIR=str(tmp_path / "none"))
     with pytest.raises(InvalidSetting, match="PLIANT_SECRETS_DIR: expected a folder"):
         Settings.from_environment()
 
 
-def test_what_a_variable_may_hold_is_stated_by_its_type_and_bounds() -> None:
+def test_expected_values_are_described_by_type_and_bounds() -> None:
     known = fields_of(Settings) | fields_of(ServiceSettings)
     assert expected_of(known["port"]) == "a whole number, at least 0, at most 65535"
     assert expected_of(known["stall_seconds"]) == "a number, more than 0"
@@ -126,7 +126,7 @@ def test_urls_default_to_the_data_directory() -> None:
     assert Settings(redis_url="redis://h", blob_url="s3://b").redis == "redis://h"
 
 
-def test_a_deep_data_directory_gets_a_short_socket() -> None:
+def test_a_deep_data_directory_gets_a_short_socket_path() -> None:
     deep = Path("/") / "/".join(["deep"] * 40)
     assert len(str(socket_path(deep))) <= LONGEST_SOCKET_PATH
     assert socket_path(deep) == socket_path(deep)
@@ -141,7 +141,7 @@ def test_cores_are_shared_among_the_workers() -> None:
 @pytest.mark.parametrize(
     ("text", "cores"), [("150000 100000\n", 2), ("20000 100000\n", 1), ("max 100000\n", 99), (None, 99)]
 )
-def test_a_container_s_share_bounds_the_cores(
+def test_a_containers_cpu_quota_limits_the_cores(
     text: str | None, cores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(99)))

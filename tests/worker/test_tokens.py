@@ -48,7 +48,7 @@ def test_the_store_holds_a_digest_and_never_the_token(tokens: Tokens, settings: 
     assert text not in kept
 
 
-def test_secrets_are_new_each_time_and_long(tokens: Tokens) -> None:
+def test_secrets_are_unique_and_32_bytes_long(tokens: Tokens) -> None:
     made = {tokens.create("same name")[1] for _ in range(50)}
     assert len({text.split("_", 2)[2] for text in made}) == 50
     assert all(len(text.split("_", 2)[2]) == 43 for text in made)  # 32 bytes in base64
@@ -109,7 +109,7 @@ def test_a_token_without_scopes_is_refused(tokens: Tokens) -> None:
         tokens.create("x", scopes=[])
 
 
-def test_durations() -> None:
+def test_durations_are_parsed_and_invalid_ones_refused() -> None:
     assert parse_duration("90d") == timedelta(days=90)
     assert parse_duration(" 12h ") == timedelta(hours=12)
     assert [parse_duration(f"2{unit}") for unit in "smw"] == [
@@ -122,7 +122,7 @@ def test_durations() -> None:
             parse_duration(wrong)
 
 
-def test_a_lifetime_has_an_end_that_is_a_date() -> None:
+def test_durations_are_limited_so_that_expiry_is_a_valid_date() -> None:
     longest = parse_duration("999999d")
     assert datetime.now(UTC) + longest < datetime.max.replace(tzinfo=UTC)
     assert parse_duration("142857w") == longest
@@ -139,7 +139,7 @@ def test_an_unavailable_store_is_an_error(tmp_path: object) -> None:
         tokens.usable()
 
 
-def test_a_token_that_a_deployment_made_is_taken_over_once(tokens: Tokens) -> None:
+def test_a_token_provided_by_a_deployment_is_adopted_once(tokens: Tokens) -> None:
     text = f"{PREFIX}0123456789ab_{'x' * 43}"
     first, same = tokens.create("first", scopes=(Scope.ADMIN,), text=text)
     assert (same, first.id, first.scopes) == (text, "0123456789ab", (Scope.ADMIN,))

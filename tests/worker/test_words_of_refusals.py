@@ -1,6 +1,6 @@
-"""The exact words of every refusal of the readers, as a user sees them.
+"""The exact message of every refusal by the readers, as a user sees it.
 
-Limits are small where a refusal is about one. Parsers run in this process: what a process of their own changes has its own tests.
+Limits are small where a refusal is about one. Parsers run in this process; their sandbox has its own tests.
 """
 
 # ruff: noqa: E501
@@ -51,7 +51,7 @@ PLACES = "v 0 0 0\n" * 20
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """Inputs that are refused, and the sentence."""
+    """Inputs that are refused, and the message."""
 
     tracks: Callable[[], bytes] = lambda: HONEST
     mesh: Callable[[], bytes] | str | None = None
@@ -170,7 +170,7 @@ CASES: dict[str, Case] = {
     "two members of one name": Case(tracks=lambda: archive(("tracks.npy", HONEST), ("tracks.npy", HONEST)),
         words="tracks: expected each member once, got 'tracks' twice. Write the file again with numpy.savez."),
     "an encrypted member": Case(tracks=encrypted,
-        words="tracks: expected stored or deflated members, got 'tracks' encrypted or packed otherwise. Write the file with numpy.savez or numpy.savez_compressed."),
+        words="tracks: expected stored or deflated members, got 'tracks' encrypted or compressed with another method. Write the file with numpy.savez or numpy.savez_compressed."),
     "no NumPy header": Case(tracks=lambda: archive(("tracks.npy", b"none at all")),
         words="tracks.tracks: expected a complete, consistent file, got no NumPy header. Write the file again."),
     "a header of another version": Case(tracks=lambda: b"\x93NUMPY\x09\x00" + bytes(100),
@@ -204,9 +204,9 @@ CASES: dict[str, Case] = {
     "complex numbers": Case(tracks=lambda: npy(WALK.astype(complex)),
         words="tracks: expected real numbers or bool of at most 64 bits, got dtype complex128. Convert the array to float64."),
     "fewer bytes than announced": Case(tracks=lambda: header(described("(6, 20, 2)"), bytes(64)),
-        words="tracks: expected a complete, consistent file, got a header that announces 1,920 bytes over 64 bytes of data. Write the file again."),
+        words="tracks: expected a complete, consistent file, got a header that declares 1,920 bytes before 64 bytes of data. Write the file again."),
     "fewer bytes in a member": Case(tracks=lambda: archive(("tracks.npy", header(described("(6, 20, 2)"), bytes(64)))),
-        words="tracks.tracks: expected a complete, consistent file, got a header that announces 1,920 bytes over 64 bytes of data. Write the file again."),
+        words="tracks.tracks: expected a complete, consistent file, got a header that declares 1,920 bytes before 64 bytes of data. Write the file again."),
     "a MATLAB file without a matrix": Case(tracks=lambda: mat(name="text"),
         words="tracks: expected a numeric matrix such as W, got variables name. Save the 2F × P matrix: save('tracks.mat', 'W', '-v7')."),
     "a MATLAB file that is cut off": Case(tracks=lambda: mat(W=np.ones((12, 20)))[:300],
@@ -288,11 +288,11 @@ CASES: dict[str, Case] = {
     "a mesh of other arrays": Case(mesh=lambda: npz(vertices=np.ones((20, 3))),
         words="mesh: expected faces, or grid, got vertices. Save the faces as numpy.savez('mesh.npz', faces=faces)."),
     "a grid of another size": Case(mesh="3x5",
-        words="mesh: expected 20 vertices, as the tracks have points, got 15. Vertex i of the mesh must be point i of the tracks, in the same order; omit the mesh to have one generated."),
+        words="mesh: expected 20 vertices, one for each point of the tracks, got 15. Vertex i of the mesh must be point i of the tracks, in the same order; omit the mesh to have one generated."),
     "a mesh of other vertices": Case(mesh=lambda: b"v 0 0 0\n" * 19 + b"f 1 2 3\n",
-        words="mesh: expected 20 vertices, as the tracks have points, got 19. Vertex i of the mesh must be point i of the tracks, in the same order; omit the mesh to have one generated."),
+        words="mesh: expected 20 vertices, one for each point of the tracks, got 19. Vertex i of the mesh must be point i of the tracks, in the same order; omit the mesh to have one generated."),
     "a mask of other pixels": Case(mesh=lambda: npz(mask=np.ones((3, 5), bool)),
-        words="mesh: expected 20 vertices, as the tracks have points, got 15. Vertex i of the mesh must be point i of the tracks, in the same order; omit the mesh to have one generated."),
+        words="mesh: expected 20 vertices, one for each point of the tracks, got 15. Vertex i of the mesh must be point i of the tracks, in the same order; omit the mesh to have one generated."),
     "a face beyond the points": Case(mesh=lambda: npz(faces=np.array([[0, 1, 99]])),
         words="mesh.faces: expected indices from 0 to 19 (the tracks have 20 points), got indices from 0 to 99. Vertex i of the mesh must be point i of the tracks; indices start at 0."),
     "a face that repeats a vertex": Case(mesh=lambda: npz(faces=np.array([[0, 1, 1]])),
@@ -350,7 +350,7 @@ CASES: dict[str, Case] = {
     "truth beyond all bounds": Case(ground_truth=lambda: npz(shapes=np.arange(360.0).reshape(6, 20, 3) * 1e30),
         words="ground_truth.shapes: expected coordinates within ±1e+12, got 3.59e+32. Check the file, or choose a larger unit."),
     "truth of one point": Case(ground_truth=lambda: npz(shapes=np.ones((6, 20, 3))),
-        words="ground_truth.shapes: expected points that differ in every frame, got a frame whose points are all one. Omit the ground truth if it is not known."),
+        words="ground_truth.shapes: expected points that differ in every frame, got a frame whose points all coincide. Omit the ground truth if it is not known."),
     "truth with too few cameras": Case(ground_truth=lambda: npz(shapes=np.arange(360.0).reshape(6, 20, 3), rotations=np.ones((5, 3, 3))),
         words="ground_truth.rotations: expected (6, 2, 3) or (6, 3, 3), got (5, 3, 3). Give one rotation a frame."),
     "cameras of other arrays": Case(rotations=lambda: npz(cameras=np.ones((6, 3, 3))),
@@ -381,16 +381,16 @@ CASES: dict[str, Case] = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_words_of_a_refusal(name: str, tmp_path: Path) -> None:
+def test_the_message_of_each_refusal(name: str, tmp_path: Path) -> None:
     case = CASES[name]
     words = str(refused(case, tmp_path))
-    if "(…)" in case.words:  # in the words of a library
+    if "(…)" in case.words:  # a library's own message
         words = re.sub(r"cannot be read \(.+?\)\. ", "cannot be read (…). ", words)
     assert words == case.words
 
 
-def test_the_words_of_a_long_json(tmp_path: Path) -> None:
-    """Reached only by a parser of its own, since a file has no more bytes than JSON may have."""
+def test_the_message_for_json_beyond_the_limit(tmp_path: Path) -> None:
+    """Reached only by calling the parser directly, since the same limit applies to the file before."""
     (tmp_path / "tracks").write_text(json.dumps([[{"x": 0.5, "y": 0.5}] * 8] * 8))
     with pytest.raises(InvalidInput) as caught:
         parse_here("json", tmp_path / "tracks", field="tracks", limits=Limits(max_bytes=512))

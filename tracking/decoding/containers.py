@@ -1,7 +1,7 @@
 """Recognise films by their content, before any decoder sees them.
 
-FFmpeg chooses a demuxer by probing, and some of its formats (HLS, concat, SDP, DASH) are texts that name other files or
-addresses. Only the binary containers below pass, and a QuickTime file whose samples lie elsewhere does not.
+FFmpeg chooses a demuxer by probing, and some of its formats (HLS, concat, SDP, DASH) are text files that refer to other files or addresses.
+Only the binary containers below are accepted, and QuickTime files only if their samples are in the same file.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ Container = Literal["mp4", "matroska", "avi", "gif", "zip", "folder"]
 
 ACCEPTED = "an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures"
 MAX_BOXES = 20_000
-"""Boxes of an MP4 file that are looked at. A fragmented film has two for every fragment of about a second."""
+"""Maximum number of boxes in an MP4 file. A fragmented film has two for every fragment of about a second."""
 
 MAX_STREAMS = 16
-"""Streams in one film: a camera writes two to five (picture, sound, metadata)."""
+"""Maximum number of streams in one film; a camera writes two to five (picture, sound, metadata)."""
 
 MP4_BOXES = {b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot"}
 NESTED = {b"moov", b"trak", b"mdia", b"minf", b"dinf"}
@@ -29,7 +29,7 @@ TEXTS = (b"#EXT", b"ffconcat", b"v=0", b"<?xml", b"<MPD", b"[playlist]", b"http"
 
 
 def recognise(path: Path) -> Container:
-    """Tell which kind of film a path is.
+    """Return the kind of film at a path.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def _recognise_stream(stream: BinaryIO, name: str) -> Container:
 
 
 def _check_mp4(stream: BinaryIO, name: str) -> None:
-    """Walk the boxes of an MP4 or QuickTime file: an index, a picture track, and samples in this file only."""
+    """Check the boxes of an MP4 or QuickTime file: it needs an index and a picture track, and all samples in the same file."""
     end = os.fstat(stream.fileno()).st_size
     kinds: list[bytes] = []
     streams = 0
@@ -108,7 +108,7 @@ def _check_mp4(stream: BinaryIO, name: str) -> None:
 
 
 def _boxes(stream: BinaryIO, end: int) -> Iterator[tuple[bytes, bytes]]:
-    """Yield type and first bytes of all boxes, going into those of `NESTED`."""
+    """Yield the type of all boxes, descending into those of `NESTED`, with the first bytes of `hdlr` and `dref` boxes."""
     pending = [(0, end)]
     while pending:
         place, stop = pending.pop()
@@ -133,7 +133,7 @@ def _boxes(stream: BinaryIO, end: int) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _self_contained(body: bytes) -> bool:
-    """Whether all data references of a `dref` box say that the samples are in the same file (flag 1)."""
+    """Return whether all data references of a `dref` box are marked as being in the same file (flag 1)."""
     count = int.from_bytes(body[4:8], "big")
     place = 8
     for _ in range(min(count, MAX_STREAMS)):
@@ -147,7 +147,7 @@ def _self_contained(body: bytes) -> bool:
 
 
 def _check_avi(head: bytes, name: str) -> None:
-    """Read the number of streams from the main header."""
+    """Check the number of streams in the main header."""
     place = head.find(b"avih")
     if place < 0 or len(head) < place + 36:
         raise _refusal("truncated_film", f"{name} without its header (avih)", "Copy it again.")

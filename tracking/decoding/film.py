@@ -19,10 +19,10 @@ from pliant.tracking.decoding.pictures import checked, folder_pictures, gif_fram
 from pliant.tracking.errors import FilmError
 
 PICTURE_RATE = 30.0
-"""Frames a second that are assumed of pictures, which carry no times."""
+"""Frames per second assumed for pictures, which have no timestamps."""
 
 WIDEST_PIXEL = 4.0
-"""Largest ratio of a pixel's sides; anamorphic and broadcast formats stay below 2."""
+"""Maximum ratio of a pixel's sides; anamorphic and broadcast formats stay below 2."""
 
 DEMUXERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 _OPENING = threading.Lock()
@@ -33,7 +33,7 @@ class Frame:
     """One frame of a film."""
 
     index: int
-    """Number in the film, from 0, counting also the frames that were not selected."""
+    """Frame number in the whole film, from 0, counting frames that are not selected."""
 
     time: float
     """Seconds from the film's start."""
@@ -52,19 +52,19 @@ class Film:
     """Width and height in pixels, upright."""
 
     fps: float
-    """Frames a second as the file states it; 30 for pictures."""
+    """Frames per second according to the file; 30 for pictures."""
 
     stated_frames: int
-    """Number of frames as the file states it; may be wrong. 0 if it states none."""
+    """Number of frames according to the file, which may be wrong; 0 if it gives none."""
 
     rotation: int
-    """Degrees clockwise by which the stored frames are turned to be upright: 0, 90, 180 or 270."""
+    """Clockwise rotation, degrees, that turns the stored frames upright: 0, 90, 180 or 270."""
 
     pixel_aspect: float
-    """Width of a stored pixel, upright, over its height; frames of other than square pixels are stretched to `size`."""
+    """Width over height of a stored pixel, upright; frames whose pixels are not square are stretched to `size`."""
 
     selection: tuple[int, int | None, int]
-    """Start, stop and step of the frames that are used."""
+    """Start, stop and step of the selected frames."""
 
     limits: FilmLimits
 
@@ -119,29 +119,29 @@ class Film:
                 yield frame if self.pixel_aspect == 1 else self._stretched(frame)
 
     def _stretched(self, frame: Frame) -> Frame:
-        """Give a frame square pixels."""
+        """Resample a frame to square pixels."""
         size = _square((frame.image.shape[1], frame.image.shape[0]), self.pixel_aspect)
         image = cv2.resize(frame.image, size, interpolation=cv2.INTER_LINEAR)
         return Frame(frame.index, frame.time, np.asarray(image, dtype=np.uint8))
 
 
 def open_film(path: Path | str, *, frames: int | slice | str | None = None, limits: FilmLimits | None = None) -> Film:
-    """Open a film after checking what it is.
+    """Open a film after checking its format.
 
     Parameters
     ----------
     path
         An mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures (PNG, JPEG, WebP,
-        BMP) in natural order. Playlists and files that refer to other files or addresses are refused.
+        BMP) in natural order. Playlists and files that refer to other files or addresses are rejected.
     frames
-        Which frames to use: a number (at most so many, evenly spaced), a slice, or its text, e.g. "0:300:2". All by default.
+        Frames to use: a maximum number, evenly spaced, a slice, or its text, e.g. "0:300:2". All by default.
     limits
-        Bytes, frames, pixels and seconds.
+        Limits on bytes, frames, pixels and seconds.
 
     Raises
     ------
     FilmError
-        Not a film that can be used, beyond the limits, or a selection that cannot be read.
+        The film cannot be used or exceeds the limits, or the selection is invalid.
     """
     source, limits = Path(path).absolute(), limits or FilmLimits()
     container = recognise(source)
@@ -156,7 +156,7 @@ def open_film(path: Path | str, *, frames: int | slice | str | None = None, limi
 
 
 class _Facts(TypedDict):
-    """Fields of `Film` that the file states."""
+    """Fields of `Film` that are read from the file."""
 
     size: tuple[int, int]
     fps: float
@@ -197,7 +197,7 @@ def _pictures(size: tuple[int, int], count: int) -> _Facts:
 
 
 def _pixel_aspect(capture: cv2.VideoCapture, rotation: int, path: Path) -> float:
-    """Width over height of an upright pixel (FFmpeg's sample aspect ratio); 1 where the film states none."""
+    """Return width over height of an upright pixel (FFmpeg's sample aspect ratio); 1 if the film gives none."""
     across, down = (capture.get(key) for key in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
     if not (across > 0 and down > 0):
         return 1.0
@@ -211,7 +211,7 @@ def _pixel_aspect(capture: cv2.VideoCapture, rotation: int, path: Path) -> float
 
 
 def _square(size: tuple[int, int], aspect: float) -> tuple[int, int]:
-    """Size of a picture in square pixels: the shorter side of a pixel is stretched, as browsers do."""
+    """Return a picture's size in square pixels: the shorter side of a pixel is stretched, as in browsers."""
     width, height = size
     return (round(width * aspect), height) if aspect >= 1 else (width, round(height / aspect))
 
@@ -240,7 +240,7 @@ def _selection(film: Film, frames: int | slice | str | None) -> tuple[int, int |
 
 
 def _count(film: Film) -> int:
-    """Count the frames by going through the film: what headers state is often wrong."""
+    """Count the frames by reading the film, because headers are often wrong."""
     if film.container in ("zip", "folder"):
         return film.stated_frames
     if film.container == "gif":
@@ -256,7 +256,7 @@ def _count(film: Film) -> int:
 
 
 def _open_capture(path: Path) -> cv2.VideoCapture:
-    """Open a film that `recognise` let pass, with FFmpeg confined to local files and the same containers."""
+    """Open a film accepted by `recognise`, with FFmpeg confined to local files and the same containers."""
     with _OPENING:
         key = "OPENCV_FFMPEG_CAPTURE_OPTIONS"  # the only way OpenCV offers to reach FFmpeg's options
         before = os.environ.get(key)
@@ -281,7 +281,7 @@ def _decode_video(path: Path, fps: float, start: int, stop: int | None, step: in
         index, last = 0, -1.0
         while (stop is None or index < stop) and capture.grab():
             time = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            # Some files have no times after the first frames, or times that stand still.
+            # Some files have no timestamps after the first frames, or repeat them.
             time = time if np.isfinite(time) and time > last else max(last, 0.0) + (1 / fps if index else 0.0)
             last = time
             if index >= start and (index - start) % step == 0:

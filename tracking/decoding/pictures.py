@@ -20,21 +20,21 @@ from pliant.tracking.errors import FilmError
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP")
 DEFAULT_DURATION = 100
-"""Milliseconds that a GIF frame without a duration is shown, as browsers do."""
+"""Display time, ms, of a GIF frame without a duration, as in browsers."""
 
 LARGEST_DIRECTORY = 4 << 20
-"""Bytes of a zip's directory: 40,000 files with names of 50 letters."""
+"""Maximum bytes of a zip's directory: 40,000 files with names of 50 letters."""
 
 Colour = NDArray[np.uint8]
 
 
 NO_MEMORY = "Error -4 "
-"""How zlib reports Z_MEM_ERROR: `zlib.error` has no number."""
+"""Start of zlib's message for Z_MEM_ERROR: `zlib.error` has no error number."""
 
 
 @contextmanager
 def readable(name: str) -> Iterator[None]:
-    """Turn what Pillow, zipfile and zlib raise on broken files into one error, and zlib's lack of memory into `MemoryError`."""
+    """Convert errors of Pillow, zipfile and zlib on broken files to `FilmError`, and zlib's lack of memory to `MemoryError`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `checked` applies the film's own limit
@@ -52,7 +52,7 @@ def readable(name: str) -> Iterator[None]:
 
 
 def natural(name: str) -> tuple[tuple[int, str], ...]:
-    """Sort key under which frame 10 follows frame 9."""
+    """Return a sort key that places frame 10 after frame 9."""
     parts = re.findall(r"\d+|\D+", name.lower())
     return tuple((int(part[:18]), "") if part.isdecimal() else (-1, part) for part in parts)
 
@@ -71,7 +71,7 @@ def read_picture(data: bytes | Path, name: str, limits: FilmLimits) -> Colour:
 
 
 def checked(size: tuple[int, int], name: str, limits: FilmLimits) -> tuple[int, int]:
-    """Return a size of at least 16×16 and at most the limit's pixels.
+    """Return a size after checking that it is at least 16×16 and within the pixel limit.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def checked(size: tuple[int, int], name: str, limits: FilmLimits) -> tuple[int, 
 
 
 def gif_frames(path: Path, limits: FilmLimits) -> Iterator[tuple[float, Colour]]:
-    """Yield time in seconds and picture of the frames of a GIF."""
+    """Yield the frames of a GIF as time in seconds and picture."""
     with readable(path.name), Image.open(path, formats=("GIF",)) as film:
         checked(film.size, path.name, limits)
         time, index = 0.0, 0
@@ -145,13 +145,13 @@ def zip_pictures(path: Path, limits: FilmLimits) -> list[tuple[str, Callable[[],
 
 
 def _unpack(path: Path, entry: zipfile.ZipInfo) -> bytes:
-    """Read one picture of a zip; never more than its directory entry states, which the limit covers."""
+    """Read one picture of a zip, at most as many bytes as its directory entry gives, which the limit covers."""
     with readable(entry.filename), zipfile.ZipFile(path) as archive, archive.open(entry) as stream:
         return stream.read(entry.file_size)
 
 
 def _check_directory(path: Path) -> None:
-    """Refuse a zip whose directory would fill the memory before its entries can be counted."""
+    """Reject a zip whose directory would fill the memory before its entries can be counted."""
     size = path.stat().st_size
     with path.open("rb") as stream:
         stream.seek(max(0, size - 65_557))

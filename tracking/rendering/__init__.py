@@ -1,4 +1,4 @@
-"""Films with exact truth, for demonstrations, tests and benchmarks."""
+"""Rendered films with exact truth, for demonstrations, tests and benchmarks."""
 
 from pliant.tracking.rendering.comparison import TrackAccuracy, Truth
 from pliant.tracking.rendering.paint import face_paint

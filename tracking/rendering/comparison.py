@@ -1,4 +1,4 @@
-"""Tracks and shapes of a rendered film against its truth."""
+"""Compare tracks and shapes with the truth of a rendered film."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from pliant.tracking.rendering.rendered_film import RenderedFilm
 
 @dataclass(frozen=True, slots=True)
 class TrackAccuracy:
-    """How well tracks follow what the template frame shows."""
+    """Accuracy of tracks against the truth."""
 
     median: float
-    """Median distance from the truth of the observations that are rightly visible, pixels."""
+    """Median distance from the truth over correctly visible observations, pixels."""
 
     p95: float
     """95th percentile of the same distances, pixels."""
@@ -31,7 +31,7 @@ class TrackAccuracy:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What the points of a tracked film truly do; P counts only the points that lie on the object in the template."""
+    """True motion of a film's tracked points; P counts only the points that lie on the object in the template."""
 
     on: NDArray[np.bool_]
     """Tracked points that lie on the object, shape `(N,)`."""
@@ -47,9 +47,9 @@ class Truth:
 
     @classmethod
     def of(cls, film: RenderedFilm, tracks: ArrayLike, template: int, frames: ArrayLike | None = None) -> Truth:
-        """Follow the points of tracks `(F, N, 2)`, in the film's pixels, from where they are in their row `template`.
+        """Follow the points of tracks `(F, N, 2)`, in the film's pixels, from their positions in row `template`.
 
-        `frames (F,)` are the numbers of the rows in the film; all frames by default.
+        `frames (F,)` holds the film's frame number of each row; all frames by default.
         """
         found = np.asarray(tracks, dtype=np.float64)
         rows = np.arange(film.num_frames) if frames is None else np.asarray(frames, dtype=np.int64)
@@ -70,9 +70,9 @@ class Truth:
         )
 
     def shape_error(self, shapes: ArrayLike, points: ArrayLike | None = None) -> float:
-        """Return `e3d_frame_scaled`: a film does not show how large things are.
+        """Return `e3d_frame_scaled`, because a film does not show absolute size.
 
-        `points (K,)` are which of the N tracked points the shapes `(F, K, 3)` are of; all by default.
+        `points (K,)` are the indices among the N tracked points of those in `shapes (F, K, 3)`; all by default.
         """
         found = np.asarray(shapes, dtype=np.float64)
         chosen = np.arange(len(self.on)) if points is None else np.asarray(points, dtype=np.int64)

@@ -1,7 +1,7 @@
-"""A short synthetic film in seconds: a textured face that talks and turns before a plain background.
+"""Render a short synthetic film in seconds: a textured face that talks and turns in front of a plain background.
 
-`RenderedFilm` evaluates its solid texture at every sample, which takes about a second of computing a frame. Here the texture
-is a picture, laid on the face from the front once.
+`RenderedFilm` evaluates its solid texture at every sample, which takes about a second per frame. Here the texture is a picture, projected
+onto the face from the front once.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pliant.tracking.rendering.rendered_film import RenderedFilm, render_film, t
 FRAMES = 30
 POINTS = 3000
 DEGREES = 45.0
-"""Turn of the face: enough for its depth to be determined."""
+"""Turn of the face: enough to determine its depth."""
 
 SIZE = (480, 360)
 FPS = 15.0
@@ -26,13 +26,13 @@ NOISE = 1.5
 """Standard deviation of the noise, grey levels."""
 
 BACKGROUND = (196.0, 201.0, 206.0)
-"""RGB; plain, so that tracking the whole picture follows the face alone."""
+"""RGB; plain, so that tracking the whole picture tracks only the face."""
 
 OUTLINE_TOLERANCE = 2.0
-"""Pixels by which the region may leave the face's outline."""
+"""Maximum distance of the region from the face's outline, px."""
 
 MARGIN = 8
-"""Pixels of texture beyond the face, so that its rim is interpolated between texture and not its border."""
+"""Pixels of texture beyond the face, so that its rim is not interpolated with the picture's border."""
 
 
 def write_example_film(path: Path | str) -> Path:
@@ -54,7 +54,7 @@ def _film() -> RenderedFilm:
 
 
 def _front(film: RenderedFilm) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Return the texture `(H, W, 3)` of the face seen from the front, and the place of its upper left corner."""
+    """Return the texture `(H, W, 3)` of the face seen from the front, and the position of its upper left corner."""
     low = film.rest[:, :2].min(axis=0) - MARGIN
     width, height = np.ceil(film.rest[:, :2].max(axis=0) + MARGIN - low).astype(int)
     x, y = np.meshgrid(np.arange(width) + low[0], np.arange(height) + low[1])

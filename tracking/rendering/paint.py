@@ -10,7 +10,7 @@ from pliant.tracking.rendering.rasterising import Floats
 SKIN, CHEEK, LIPS = (216.0, 172.0, 148.0), (214.0, 146.0, 128.0), (168.0, 84.0, 84.0)
 BROW, WHITE, IRIS = (92.0, 66.0, 52.0), (232.0, 228.0, 222.0), (64.0, 84.0, 96.0)
 INSIDE = (96.0, 38.0, 42.0)
-"""sRGB, 0–255; the last is the inside of the mouth, which shows when the jaw drops."""
+"""sRGB, 0–255; `INSIDE` is the inside of the mouth, visible when the jaw drops."""
 
 
 def face_paint(num_points: int) -> Floats:

@@ -16,7 +16,7 @@ FRAGMENTS = 2_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """What each pixel of one frame shows of a mesh."""
+    """Visible surface of a mesh at each pixel of one frame."""
 
     triangle: Ints
     """Index of the nearest triangle, shape `(H, W)`; −1 where the mesh covers nothing."""
@@ -65,7 +65,7 @@ def rasterise(pixels: Floats, depth: Floats, triangles: Ints, *, size: tuple[int
 
 
 def _fragments(corners: Floats, width: int, height: int) -> tuple[Ints, Ints, Floats]:
-    """Pixel, triangle and screen barycentric coordinates of all covered pixels, for triangles of one size at a time."""
+    """Return pixel, triangle and screen barycentric coordinates of all covered pixels, processing triangles by size."""
     low = np.maximum(np.floor(corners.min(axis=1)), 0).astype(np.int64)
     high = np.minimum(np.ceil(corners.max(axis=1)), (width - 1, height - 1)).astype(np.int64)
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]

@@ -1,6 +1,6 @@
 """Films with exact truth: a textured gallery surface in front of a background, seen by a pinhole camera.
 
-The demonstration and the tests track these films and compare with `RenderedFilm.follow`.
+The demonstration and the tests track these films and compare the result with `RenderedFilm.follow`.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ SUPERSAMPLING = 2
 """Samples per pixel side."""
 
 WAVES = 80
-"""Plane waves that make up a texture."""
+"""Number of plane waves in a texture."""
 
 FINEST, COARSEST = 6.0, 0.35
 """Wavelengths of a texture: the finest in pixels, which sampling and blur leave visible, the coarsest in image heights."""
 
 FRECKLES, DIM = 0.32, 0.45
-"""With paint: how much the texture changes its brightness, and the background's brightness, both as shares."""
+"""With paint: how much the texture varies its brightness, and the brightness of the background, as shares."""
 
 LAYER = 0.04
-"""A point is visible if it lies at most this far behind the nearest surface, in radii of the object. The facets of a gallery
-mesh deviate less from one another; two layers of a closed body lie further apart."""
+"""A point is visible if it is at most this far behind the nearest surface, in radii of the object. The facets of a gallery mesh deviate
+less from one another; two layers of a closed body are further apart."""
 
 CODECS = {".avi": "FFV1", ".mkv": "FFV1", ".mp4": "mp4v", ".mov": "mp4v", ".webm": "VP80"}
 """Codec by file suffix; FFV1 is lossless, the others are the ones that every OpenCV wheel encodes."""
@@ -53,7 +53,7 @@ class RenderedFilm:
     """Shape `(T, 3)`."""
 
     rest: Floats
-    """Vertices the solid texture belongs to, shape `(P, 3)`, film pixels."""
+    """Vertices in the coordinates of the solid texture, shape `(P, 3)`, film pixels."""
 
     blur: float
     """Standard deviation of the lens blur in pixels."""
@@ -68,7 +68,7 @@ class RenderedFilm:
     """Whether a textured bar passes in front of the object once."""
 
     seed: int
-    """Of texture, background and noise."""
+    """Seed of texture, background and noise."""
 
     @property
     def num_frames(self) -> int:
@@ -119,7 +119,7 @@ class RenderedFilm:
         return mask
 
     def follow(self, points: Floats, index: int) -> tuple[Floats, NDArray[np.bool_], Floats]:
-        """Follow what frame `index` shows at the given places through the film.
+        """Follow surface points, given by their pixels in frame `index`, through the film.
 
         Parameters
         ----------
@@ -150,9 +150,9 @@ class RenderedFilm:
         path
             The file to write.
         fps
-            Frames a second.
+            Frames per second.
         frame
-            Renders a frame by its index in place of `self.frame`.
+            Function that renders a frame by its index, instead of `self.frame`.
 
         Raises
         ------
@@ -195,7 +195,7 @@ class RenderedFilm:
         return rasterise(pixels, shape[:, 2], self.triangles, size=(self.size[0] * fine, self.size[1] * fine))
 
     def _hit(self, points: Floats, index: int) -> tuple[Ints, Floats]:
-        """Corners `(N, 3)` and weights `(N, 3)` of the places on the surface; NaN weights where there is none."""
+        """Return triangle corners and barycentric weights of points on the surface, each `(N, 3)`; NaN weights off the surface."""
         fine = 4
         surface = self._surface(index, fine)
         column, row = np.round((np.asarray(points) + 0.5) * fine - 0.5).astype(int).T
@@ -226,7 +226,7 @@ class RenderedFilm:
         return np.asarray(seen)
 
     def _bar(self, index: int) -> tuple[float, float]:
-        """Left and right edge of the occluder, pixels: it crosses the image once, in the last two thirds of the film."""
+        """Return the occluder's left and right edge, pixels: it crosses the image once, in the last two thirds of the film."""
         time = (index / max(self.num_frames - 1, 1) - 0.33) / 0.67
         left = -0.2 * self.size[0] + 1.2 * self.size[0] * time
         return left, left + 0.15 * self.size[0]
@@ -244,7 +244,7 @@ def render_film(
     occluder: bool = False,
     seed: int = 0,
 ) -> RenderedFilm:
-    """Set a gallery sequence before a pinhole camera.
+    """Place a gallery sequence in front of a pinhole camera.
 
     Parameters
     ----------
@@ -272,7 +272,7 @@ def render_film(
 
 
 def texture(points: Floats, height: int, seed: int) -> Floats:
-    """Evaluate a solid texture: soft-clipped sums of plane waves; `(N, 3)` places in pixels to `(N, 3)` grey levels."""
+    """Evaluate a solid texture, soft-clipped sums of plane waves, at positions `(N, 3)` in pixels; return grey levels `(N, 3)`."""
     random = np.random.default_rng(seed)
     direction = random.standard_normal((WAVES, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)

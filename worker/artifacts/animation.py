@@ -24,8 +24,8 @@ BLOCK = 1 << 21
 """Numbers in a block of points over all frames (16 MB)."""
 
 OVERSAMPLING, SUBSPACE_ROUNDS = 10, 3
-"""Additional vectors and rounds of the subspace iteration. How many modes are kept is decided by their true errors, so that an inaccurate
-vector could only cost a further mode."""
+"""Additional vectors and rounds of the subspace iteration. The number of modes depends on their true errors, so an inaccurate vector can
+only cost a further mode."""
 
 ERROR_BOUND = 1e-3
 """Maximum error of a point's position due to modes, as a share of the bounding box's diagonal."""
@@ -63,7 +63,7 @@ def animate(shapes: Floats, *, y_axis: str = "up", motion: str = "auto") -> Anim
         return _modes(shapes, y_axis, MAX_MODE_TARGETS)
     if motion == "frames" or len(shapes) < 3:
         return _per_frame(shapes, y_axis)
-    return _modes(shapes, y_axis, len(shapes) - 1)  # as many hold any motion, and are still fewer than the frames
+    return _modes(shapes, y_axis, len(shapes) - 1)  # enough for any motion, and still fewer than the frames
 
 
 def _per_frame(shapes: Floats, y_axis: str) -> Animation:
@@ -117,8 +117,8 @@ def _modes(shapes: Floats, y_axis: str, most: int) -> Animation:
 def leading(gram: Floats, most: int) -> Floats:
     """Return the eigenvectors of the largest eigenvalues of a Gram matrix, as columns, largest first.
 
-    Of long films by subspace iteration (Halko, Martinsson, Tropp, "Finding structure with randomness", 2011, algorithm 4.4): SciPy's
-    `eigh` holds the interpreter's lock, at 3,000 frames for 2 s, in which no thread can report progress.
+    For long films, subspace iteration is used (Halko, Martinsson, Tropp, "Finding structure with randomness", 2011, algorithm 4.4): SciPy's
+    `eigh` would hold the interpreter's lock, for 2 s at 3,000 frames, so that no thread could report progress.
     """
     frames = len(gram)
     if frames <= MAX_FRAME_TARGETS:
@@ -130,7 +130,7 @@ def leading(gram: Floats, most: int) -> Floats:
 
 
 def _blocks(shapes: Floats, y_axis: str, origin: Floats | Singles) -> Iterator[tuple[slice, Floats]]:
-    """Displacements from one shape `(P, 3)`, y up, as `(F, 3 · points)`, a block of points at a time."""
+    """Yield displacements from one shape `(P, 3)`, y up, as `(F, 3 · points)`, a block of points at a time."""
     points = max(1, BLOCK // (3 * len(shapes)))
     for start in range(0, shapes.shape[1], points):
         some = slice(start, start + points)
@@ -150,7 +150,7 @@ def _smallest(shapes: Floats, y_axis: str, mean: Floats, left: Floats, allowed: 
 
 
 def _within(distance: float, blocks: Iterator[tuple[slice, Floats]], left: Floats) -> bool:
-    """Whether every point of every frame is within a distance of its projection on the modes."""
+    """Return whether every point of every frame is within a distance of its projection on the modes."""
     for _, moved in blocks:
         rest = moved - left @ (left.T @ moved)
         if (rest.reshape(len(rest), -1, 3) ** 2).sum(axis=2).max() > distance**2:

@@ -47,14 +47,14 @@ class Painting:
         return cls(quantity, values, known, unit, top if top > 0 else 1.0)
 
     def frame(self, index: int) -> Floats:
-        """Colours `(P, 3)` of one frame, sRGB in [0, 1]."""
+        """Return the colours `(P, 3)` of one frame, sRGB in [0, 1]."""
         colours = shade(self.values[index] / self.top)
         if self.known is not None:
             colours[~self.known[index]] = UNKNOWN
         return colours
 
     def mean(self) -> Floats:
-        """Colours `(P, 3)` of the mean over the frames that have a value, sRGB in [0, 1]."""
+        """Return the colours `(P, 3)` of the mean over the frames that have a value, sRGB in [0, 1]."""
         if self.known is None:
             return shade(self.values.mean(axis=0) / self.top)
         count = self.known.sum(axis=0)
@@ -70,7 +70,7 @@ class Painting:
 
 
 def shade(share: Floats) -> Floats:
-    """Colours `(N, 3)`, sRGB, of shares `(N,)` of the scale; beyond 1 the brightest."""
+    """Return the colours `(N, 3)`, sRGB, of values `(N,)` as shares of the scale; the brightest above 1."""
     place = np.clip(share, 0, 1) * (len(STOPS) - 1)
     return np.stack([np.interp(place, np.arange(len(STOPS)), STOPS[:, i]) for i in range(3)], axis=1)
 

@@ -20,7 +20,7 @@ OnProgress = Callable[[float], None]
 
 
 def write_ply_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> None:
-    """Binary little-endian PLY of every frame, `frame_00000.ply` …; single precision, unit of the tracks."""
+    """Write a binary little-endian PLY for every frame, `frame_00000.ply` …; single precision, in the tracks' unit."""
     faces = result.faces
     rows = np.zeros(len(faces), dtype=[("count", "u1"), ("index", "<i4", (faces.shape[1],))])
     rows["count"], rows["index"] = faces.shape[1], faces
@@ -50,7 +50,7 @@ def write_ply_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> N
 
 
 def write_obj_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> None:
-    """Wavefront OBJ of every frame, `frame_00000.obj` …; nine digits, which is single precision, unit of the tracks.
+    """Write a Wavefront OBJ for every frame, `frame_00000.obj` …; nine digits, which is single precision, in the tracks' unit.
 
     Colours follow the coordinates, as MeshLab, Blender and Open3D expect. With a texture, the archive also contains `shapes.mtl` and
     `texture.jpg`; v of `vt` points up.

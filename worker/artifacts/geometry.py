@@ -18,12 +18,12 @@ def triangles_of(faces: Ints) -> Ints:
 
 
 def upright(shapes: Floats, y_axis: str) -> Floats:
-    """Turn shapes to y up, right-handed: half a turn about x where y points down, so nothing is mirrored."""
+    """Rotate shapes to y up, right-handed: half a turn about x if y points down, so nothing is mirrored."""
     return shapes if y_axis == "up" else shapes * np.array([1.0, -1.0, -1.0])
 
 
 def vertex_normals(points: Floats | Singles, triangles: Ints) -> Singles:
-    """Area-weighted unit normals `(P, 3)`; points of no face, or of faces without area, get (0, 0, 1)."""
+    """Return area-weighted unit normals `(P, 3)`; (0, 0, 1) for points without a face or with faces of zero area only."""
     one, two, three = (points[triangles[:, i]].astype(np.float64) for i in range(3))
     doubled = np.cross(two - one, three - one)
     total = np.zeros((len(points), 3))

@@ -1,4 +1,4 @@
-"""Write an animated binary glTF 2.0 (.glb): one mesh, morph targets, a camera, one animation of their weights and its motion.
+"""Write an animated binary glTF 2.0 (.glb): one mesh with morph targets, a camera, and one animation of both.
 
 The file is streamed: the JSON comes first, so sizes, offsets, minima and maxima are computed before any array is written.
 """
@@ -110,11 +110,10 @@ def write_glb(
 ) -> None:  # fmt: skip
     """Write the animation, y up and right-handed, from the file's current position.
 
-    Frame f is at f / fps seconds, with linear interpolation between; without triangles `(T, 3)` it is a cloud of points. `node`
-    has the properties of the node besides the mesh, e.g. `scale`. `normals` are `static` (those of the base shape), `animated`
-    (displaced with the targets) or `none`. `quantized` writes 16-bit positions and 8-bit normals by KHR_mesh_quantization.
-    `colours (P, 4)` are RGBA, linear light, 65535 for 1. The camera of `view` follows the mesh. `on_progress` gets the share of
-    bytes written.
+    Frame f is at f / fps seconds, with linear interpolation in between. Without triangles `(T, 3)` a point cloud is written. `node` holds
+    the properties of the node besides the mesh, e.g. `scale`. `normals` are `static` (those of the base shape), `animated` (displaced with
+    the targets) or `none`. `quantized` writes 16-bit positions and 8-bit normals by KHR_mesh_quantization. `colours (P, 4)` are RGBA,
+    linear light, 65535 for 1. The camera of `view` follows the mesh. `on_progress` gets the share of arrays written.
     """
     buffer = Buffer()
     positions, target, placed = _rounded(animation, node, quantized=quantized)
@@ -162,7 +161,7 @@ def _attributes(
     *,
     quantized: bool,
 ) -> dict[str, int]:
-    """Add what every point of the base shape has."""
+    """Add the vertex attributes of the base shape."""
     attributes = {"POSITION": buffer.add(positions, target=VERTICES, bounds=True, normalised=quantized)}
     if normals is not None:
         rounded = _in_bytes(normals) if quantized else normals
@@ -193,7 +192,7 @@ def _add_picture(document: dict[str, Any], buffer: Buffer, texture: Texture) -> 
 
 
 def _add_camera(document: dict[str, Any], buffer: Buffer, view: View) -> None:
-    """Add camera, node and the two channels of its motion; their times are those of the weights."""
+    """Add camera, node and the two channels of its motion, with the times of the weights."""
     document["cameras"] = [view.lens]
     document["nodes"].append(
         {"name": "camera", "camera": 0, "rotation": view.rotations[0].tolist(), "translation": view.translations[0].tolist()}
@@ -210,7 +209,7 @@ def _add_camera(document: dict[str, Any], buffer: Buffer, view: View) -> None:
 def _normals(
     animation: Animation, triangles: Ints, normals: str
 ) -> tuple[Singles | None, Callable[[int], Singles | None] | None]:
-    """Return the normals of the base shape, and what gives their displacement for a target (None: zero); None for what is left out."""
+    """Return the base normals, and a function that gives their displacement for a target (None: zero); None for whatever is omitted."""
     if normals == "none":
         return None, None
     if normals == "static":
@@ -232,7 +231,7 @@ def _targets(
         entry = {"POSITION": buffer.add(partial(target, index), target=VERTICES, bounds=True, normalised=quantized)}
         if normals is not None:
             if normals(index) is None:
-                # Left out, three.js would take the base's normals for the displacement.
+                # Without NORMAL here, three.js would use the base normals as the displacement.
                 zeros = buffer.add_zeros(len(animation.base), normalised=quantized) if zeros is None else zeros
                 entry["NORMAL"] = zeros
             else:
@@ -250,7 +249,7 @@ def _displacement(normals: Callable[[int], Singles | None], index: int, quantize
 
 
 def _in_bytes(normals: Singles) -> NDArray[np.int8]:
-    """Round normals, or their displacements, to bytes: right to half a degree. Displacements beyond 1 are cut off."""
+    """Round normals or their displacements to bytes, exact to half a degree; displacements beyond 1 are clipped."""
     return np.rint(np.clip(normals, -1, 1) * 127).astype(np.int8)
 
 
@@ -276,7 +275,7 @@ def _rounded(
 
 def _material(*, coloured: bool, textured: bool) -> dict[str, Any]:
     if textured:
-        # The film has its light in the picture, so the surface adds no highlights of its own.
+        # The picture of the film already contains its lighting, so the surface adds no highlights.
         return {
             "name": "film", "doubleSided": True,
             "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0},

@@ -50,7 +50,7 @@ def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0), textured: boo
     Raises
     ------
     InvalidInput
-        A requested file cannot be written in this installation or in this size.
+        A requested file cannot be written in this installation or at this size.
     """
     for output, there, package, extra in (
         ("usd", usd.available, "usd-core", "usd"),

@@ -12,17 +12,17 @@ TEXT_BYTES = 116
 """Length of the text at the start of a file; version and byte order follow."""
 
 MOST_BYTES = 2**31
-"""Upper bound of the size of a variable in this format, bytes."""
+"""Upper bound of the size of one variable in this format, bytes."""
 
 
 def fits(num_frames: int, num_points: int) -> bool:
-    """Whether the shapes fit into a variable."""
+    """Return whether the shapes fit into one variable."""
     return 24 * num_frames * num_points < MOST_BYTES
 
 
 def write_mat(result: Result, file: IO[bytes]) -> None:
     """Write the arrays of `shapes.npz` under the same names; indices in `faces` count from 1, `point_names` is a cell array."""
-    import scipy.io  # not for the API process, which writes no file
+    import scipy.io  # imported here, because the API process writes no files
 
     solution, camera = result.solution, result.solution.camera
     names = result.inputs.point_names
@@ -48,7 +48,7 @@ def write_mat(result: Result, file: IO[bytes]) -> None:
         },
         oned_as="column",
     )
-    # SciPy writes the time of day there; equal results are equal files.
+    # SciPy writes the time of day there; a fixed text makes equal results equal files.
     end = file.tell()
     file.seek(0)
     file.write(HEADER.ljust(TEXT_BYTES))

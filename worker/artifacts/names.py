@@ -1,4 +1,4 @@
-"""The object's name in the result files: that of the job, in the characters that each format takes."""
+"""The object's name in the result files: the job's name, in the characters that each format allows."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ DEFAULT = "shape"
 """Name of an object whose job has none, or none that a format can write."""
 
 MAX_OBJECT_NAME = 200
-"""Characters of a name."""
+"""Maximum characters of a name."""
 
 
 def object_name(text: str) -> str:
-    """Return a name as it is shown, for formats that take any text (glTF).
+    """Return a display name, for formats that allow any text (glTF).
 
-    Composed (NFC), so that a file's name is the same on every system; bytes of a path that are not UTF-8 become `?`.
+    Names are composed (NFC), so that a file's name is the same on every system; bytes of a path that are not UTF-8 become `?`.
     """
     whole = unicodedata.normalize("NFC", text.encode("utf-8", "replace").decode())
     return one_line(whole)[:MAX_OBJECT_NAME].strip() or DEFAULT
 
 
 def identifier(text: str) -> str:
-    """Return a name as USD and Alembic identify objects: ASCII letters, digits and underscores, no digit first.
+    """Return an identifier for USD and Alembic: ASCII letters, digits and underscores, not starting with a digit.
 
-    Letters lose their accents; all other characters become underscores, one for each run of them.
+    Accents are removed; each run of other characters becomes one underscore.
     """
     word = re.sub(r"[^A-Za-z0-9]+", "_", _ascii(object_name(text))).strip("_")
     return f"_{word}" if word[:1].isdigit() else word or DEFAULT
 
 
 def header_line(text: str) -> str:
-    """Return a name for the header of a PLY file, which is ASCII and ends with the word `end_header`."""
+    """Return a name for the header of a PLY file, which is ASCII and ends at the word `end_header`."""
     return one_line(_ascii(object_name(text)).replace("end_header", "end header")) or DEFAULT
 
 

@@ -19,7 +19,7 @@ NORMAL_BOUND = float(np.radians(5))
 On 99 face scans it keeps 4 of 9 targets, with half the error of all 9 to first order."""
 
 FRAMES_OF_FIT = 100
-"""Frames that the fit uses, evenly spaced, or four for each coefficient where that is more: it bounds the time for long sequences."""
+"""Evenly spaced frames in the fit, or four for each coefficient if that is more; bounds the time for long sequences."""
 
 LEAST_LENGTH = 0.1
 """Length of the constant part b below which a vertex keeps its mean normal, because the division by it would amplify noise."""
@@ -40,8 +40,8 @@ class FittedNormals:
 
 
 def fit_normals(animation: Animation, triangles: Ints) -> FittedNormals:
-    """Fit the normals of the frames of an animation in modes, which has triangles `(T, 3)`, in one pass over the frames."""
-    import scipy.linalg  # not for the API process, which writes no file
+    """Fit the normals of an animation in modes, with triangles `(T, 3)`, in one pass over its frames."""
+    import scipy.linalg  # imported here, because the API process writes no files
 
     frames, modes = animation.weights.shape
     step = max(1, frames // max(FRAMES_OF_FIT, 4 * (modes + 1)))
@@ -58,7 +58,7 @@ def fit_normals(animation: Animation, triangles: Ints) -> FittedNormals:
     left = np.maximum(1 - np.cumsum(explained) / (len(used) * len(animation.base)), 0)
     enough = np.flatnonzero(np.sqrt(left[1:]) <= NORMAL_BOUND)
     count = int(enough[0]) + 1 if len(enough) else len(left) - 1
-    # The columns are dependent where nothing moves; least squares has no trouble with that.
+    # The columns are linearly dependent if nothing moves, which the pseudo-inverse permits.
     inverse = np.linalg.pinv(r[: count + 1, : count + 1], rcond=1e-6).astype(np.float32)
     fitted = np.tensordot(inverse, projected[: count + 1], axes=1)
     mean = design.mean(axis=0)[: count + 1].astype(np.float32)

@@ -18,12 +18,12 @@ residuals  int16 (F, P, 2)     track − projection = residual_step · value; bo
 truth      int16 (F, P, 3)     as positions, aligned with the result as for `e3d_frame`; only with ground truth
 frames     float32 (F, 6)      translation x, y; hidden share; expected error and `e3d_frame` as shares of the object's
                                size; median residual. NaN where unknown
-points     uint32 (P, 2)       in how many of all frames each point was seen, and in how many of these it was rejected
+points     uint32 (P, 2)       number of frames, of all, that show each point, and number in which it was rejected
 spread     uint16 (F, P)       standard deviation of a position = spread_step · value. Only with a posterior
 rejected   uint8 (F, ⌈P/8⌉)    bits, the lowest first: seen observations that the solver rejected as outliers
 names      UTF-8, P lines      names of the points. Only where the tracks' file has them
-places     float32 (P, 2)      place of every point in the picture, 0 to 1: u right, v down. Only of a film
-picture    JPEG                the film's template frame. Only of a film
+places     float32 (P, 2)      position of every point in the picture, 0 to 1: u right, v down. Only for films
+picture    JPEG                the film's template frame. Only for films
 =========  ==================  ===================================================================================
 
 Readers skip sections that they do not know; all after `residuals` may be missing.
@@ -55,7 +55,7 @@ LARGEST = 32767
 LARGEST_COUNT = 65535
 HIDDEN = -32768
 LEAST_TRUE = 3
-"""Points with truth that an alignment needs."""
+"""Minimum number of points with truth for an alignment."""
 MOST_OBSERVATIONS = 16_000_000
 """Number of points × frames (96 MB of positions) above which only every n-th frame is written."""
 
@@ -83,7 +83,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Rounding:
-    """What the whole numbers of the file are multiples of, the tracks' unit."""
+    """Steps of the integers in the file, in the tracks' unit."""
 
     box: Box
     residual_step: float
@@ -92,7 +92,7 @@ class Rounding:
 
     @classmethod
     def of(cls, tracks: Tracks, solution: Solution, facing: Floats | None) -> Rounding:
-        """Return the finest steps that reach every value; `facing` is the truth aligned with the result."""
+        """Return the finest steps that cover every value; `facing` is the truth aligned with the result."""
         std = solution.shapes_std
         return cls(
             Box.around(solution.shapes) if facing is None else Box.around(solution.shapes, facing),
@@ -101,7 +101,7 @@ class Rounding:
         )
 
     def header(self) -> dict[str, object]:
-        """Return the entries of the header that turn the numbers back."""
+        """Return the header entries that restore the values."""
         return {
             "origin": self.box.origin.tolist(),
             "step": self.box.step,
@@ -138,10 +138,10 @@ def write_preview(
     point_names: Sequence[str] | None = None,
     texture: Texture | None = None,
 ) -> None:
-    """Write the file: what was solved, its result, and where they are known the truth `(F, P, 3)`, in any axes, NaN where unknown.
+    """Write the file from tracks, solution and, if known, the truth `(F, P, 3)`, in any axes, NaN where unknown.
 
-    `y_axis` is the direction of the image's y axis; `fps` counts frames before some are skipped; `image_size` is as the option
-    has it.
+    `y_axis` is the direction of the image's y axis; `fps` is the rate before frames are skipped; `image_size` is WIDTHxHEIGHT, as in the
+    option.
     """
     stride = max(1, -(-solution.shapes[..., 0].size // MOST_OBSERVATIONS))
     facing, mirrored = (None, False) if truth is None else _onto(solution.shapes, truth)
@@ -168,7 +168,7 @@ def write_preview(
 
 
 def _input_sections(point_names: Sequence[str] | None, texture: Texture | None) -> list[Section]:
-    """Return the sections that only some inputs have: names of the points, and the picture with their places in it."""
+    """Return the sections that only some inputs have: names of the points, and the picture with the points' positions in it."""
     sections = []
     if point_names is not None:
         names = "\n".join(point_names).encode()

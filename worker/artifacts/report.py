@@ -65,7 +65,7 @@ def build_report(
 
 
 def described_camera(solution: Solution, options: Options) -> dict[str, Any]:
-    """Return what is the same in all frames: model, lens, how they were chosen, and a sentence.
+    """Return the camera properties common to all frames: model, lens, how they were chosen, and a sentence.
 
     The horizontal field of view of a picture W wide is 2 atan(W / 2φ), in degrees; its standard deviation is that of φ times |dθ/dφ|.
     """
@@ -117,7 +117,7 @@ def _trust(trust: Trust | None) -> dict[str, Any]:
 
 
 _TRUST_FIGURES = ("turn_degrees", "degrees_per_frame", "deformation_per_frame", "held_out_error")
-"""Figures of `Trust` under their own names, beside those of the verdict; the others are in the report already."""
+"""Figures of `Trust` reported under their own names, besides those of the verdict; the report has the others already."""
 
 
 def peak_memory() -> int | None:
@@ -137,7 +137,7 @@ def versions() -> dict[str, str]:
 
 
 def _plain(value: Any) -> Any:
-    """Return None for NaN and infinity, which JSON lacks."""
+    """Convert to plain values for JSON; NaN and infinity, which JSON lacks, become None."""
     if isinstance(value, Mapping):
         return {str(name): _plain(item) for name, item in value.items()}
     if isinstance(value, list | tuple):

@@ -22,7 +22,7 @@ class Result:
     solution: Solution
     options: Options
     name: str = ""
-    """Name of the job, from which the objects in the files have theirs; see `names`."""
+    """Name of the job, from which the names of the objects in the files derive; see `names`."""
 
     @property
     def y_axis(self) -> str:
@@ -31,7 +31,7 @@ class Result:
 
     @property
     def image_size(self) -> tuple[float, float] | None:
-        """Width and height of the picture, pixels; None where the options do not state them."""
+        """Width and height of the picture, pixels; None if the options do not give them."""
         if self.options.image_size is None:
             return None
         width, height = self.options.image_size.split("x")
@@ -77,5 +77,5 @@ class Result:
         return None if self.inputs.texture is None or self.painting is not None else self.inputs.texture.colours()
 
     def standing(self, frame: int) -> Floats:
-        """Points `(P, 3)` of a frame, y up, right-handed."""
+        """Return the points `(P, 3)` of a frame, y up, right-handed."""
         return upright(self.solution.shapes[frame], self.y_axis)

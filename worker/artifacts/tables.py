@@ -71,7 +71,7 @@ def _mean(values: Floats, weights: Floats | NDArray[np.bool_]) -> Floats:
 
 
 def _write(file: IO[bytes], columns: Mapping[str, Column]) -> None:
-    """Return numbers in the shortest form that restores them exactly."""
+    """Write the columns, with numbers in the shortest form that restores them exactly."""
     text = io.TextIOWrapper(file, encoding="utf-8", newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)

@@ -38,17 +38,17 @@ class View:
     """World from camera, unit quaternions x, y, z, w without jumps of sign, shape `(F, 4)`."""
 
     translations: Singles
-    """Places of the camera in the units of the file's scene, shape `(F, 3)`."""
+    """Positions of the camera in the units of the file's scene, shape `(F, 3)`."""
 
 
 def view_of(
     camera: Camera, shapes: Floats, *, y_axis: str, scale: float, image_size: tuple[float, float] | None = None
 ) -> View:
-    """Return the glTF camera of shapes `(F, P, 3)` that the scene holds turned to y up and multiplied by `scale`.
+    """Return the glTF camera for shapes `(F, P, 3)`, which the scene contains rotated to y up and multiplied by `scale`.
 
-    A glTF camera cannot change its magnification: for orthographic cameras it is the geometric mean of the scales, and the range
-    of the scales is listed in `extras`. `y_axis` is where y of the tracks points. Without `image_size`, pixels, the view holds
-    all projected points.
+    A glTF camera cannot change its magnification: for orthographic cameras it is the geometric mean of the scales, and the range of the
+    scales is listed in `extras`. `y_axis` is the direction of the tracks' y axis. Without `image_size`, pixels, the view contains all
+    projected points.
     """
     axes = np.array([1.0, -1.0, -1.0]) if y_axis == "down" else np.ones(3)
     centre = _centre(camera, image_size)
@@ -108,8 +108,8 @@ def _stated(camera: Camera, centre: Floats, size: Floats, image_size: tuple[floa
 
 
 def _quaternions(rotations: Floats) -> Singles:
-    """Return unit quaternions x, y, z, w; neighbours lie on one side, so that a viewer turns the short way between them."""
-    from scipy.spatial.transform import Rotation  # not for the API process, which writes no file
+    """Return unit quaternions x, y, z, w; neighbours are in one hemisphere, so that viewers interpolate along the shorter arc."""
+    from scipy.spatial.transform import Rotation  # imported here, because the API process writes no files
 
     found = Rotation.from_matrix(rotations).as_quat()
     turns = np.where((found[1:] * found[:-1]).sum(axis=1) < 0, -1.0, 1.0)

@@ -18,17 +18,17 @@ from pliant.worker.artifacts.kinds import Kind, kinds_for
 from pliant.worker.artifacts.result import Result
 from pliant.worker.formats import Inputs
 
-REPORT = "How the result came to be: options, choices with reasons, metrics, trace, timings, versions."
+REPORT = "How the result was computed: options, choices with reasons, metrics, trace, timings, versions."
 
 
 def write_artifacts(
     inputs: Inputs, solution: Solution, options: Options, report: dict[str, Any], directory: Path, *, name: str = "",
     on_progress: OnProgress | None = None,
 ) -> list[Artifact]:  # fmt: skip
-    """Write the result files that a job's options ask for into a directory that exists; return them in the order written.
+    """Write the result files that a job's options request into an existing directory; return them in the order written.
 
-    `artifacts` and `seconds.exporting` are added to `report`, whose `artifacts` may list files that are there already; it is
-    written last. `name` is that of the object in the files. `on_progress` gets the share that is done, in [0, 1].
+    The report is written last, with `artifacts` and `seconds.exporting` added; its `artifacts` may list files written earlier. `name` is
+    the job's, from which the objects in the files are named. `on_progress` gets the completed share, in [0, 1].
 
     Raises
     ------
@@ -50,7 +50,7 @@ def write_artifacts(
 def write_kinds(
     result: Result, kinds: Sequence[Kind], directory: Path, *, on_progress: OnProgress
 ) -> tuple[list[Artifact], dict[str, Any]]:
-    """Write some result files, as `write_artifacts`; return them in the order of `kinds`, and what the report states of each."""
+    """Write files of the given kinds, as `write_artifacts` does; return them in the order of `kinds`, and their report entries."""
     written: list[Artifact] = []
     entries: dict[str, Any] = {}
     done, total = 0.0, sum(kind.share for kind in kinds)

@@ -45,7 +45,7 @@ STATUS_INTERVAL = 0.25
 """Minimum seconds between two reads of the job's status."""
 
 PATIENCE = 60.0
-"""Seconds to wait for an unavailable store, to claim the job, before computing and when publishing the result."""
+"""Seconds for which calls to an unavailable store are retried when claiming the job, reading its inputs and publishing its result."""
 
 
 def run(id: str, attempt_id: str, *, settings: Settings, worker: str) -> None:
@@ -72,7 +72,7 @@ def run(id: str, attempt_id: str, *, settings: Settings, worker: str) -> None:
 
 
 def _conclude(attempt: Attempt, stored: Stored, *, worker: str, settings: Settings) -> str:
-    """Work on a claimed attempt, with its own output and memory limit, and record the outcome; return it in a word."""
+    """Run a claimed attempt with redirected output and a memory limit, record its outcome and return it as one word."""
     directory = working_directory(settings, attempt.attempt_id)
     directory.mkdir(parents=True, exist_ok=True)
     attempt.log(f"Attempt {stored.job.attempt} began on worker {worker}.")
@@ -90,7 +90,7 @@ def _conclude(attempt: Attempt, stored: Stored, *, worker: str, settings: Settin
 
 @dataclass(slots=True, kw_only=True)
 class Attempt:
-    """One attempt at a job, as seen by the job process: writes progress and outcome, reads the status."""
+    """One attempt at a job, in the job process: writes progress and outcome, reads the job's status."""
 
     jobs: Jobs
     id: str
@@ -103,15 +103,15 @@ class Attempt:
     _next_report: float = 0.0
     _stage: str = ""
     stages: tracing.Stages = field(default_factory=tracing.Stages)
-    """Spans of the trace, where there is one."""
+    """Trace spans of the stages."""
     _next_look: float = 0.0
     _lines: list[str] = field(default_factory=list)
-    """Lines of the log that are not written yet."""
+    """Log lines that are not written yet."""
     _log_lock: threading.Lock = field(default_factory=threading.Lock)
-    """Held while `_lines` changes and is written: progress is repeated from a thread of its own."""
+    """Guards `_lines`, because a separate thread repeats the progress."""
 
     def report(self, progress: Progress) -> None:
-        """Write the progress: each new stage, else at most every `PROGRESS_INTERVAL` seconds. An unavailable store is ignored."""
+        """Write the progress, at most every `PROGRESS_INTERVAL` seconds within a stage. An unavailable store is ignored."""
         self.stages.enter(progress.stage)
         now = time.monotonic()
         if now < self._next_report and progress.stage == self._stage:
@@ -128,23 +128,23 @@ class Attempt:
             logger.warning("progress not written: %s", error)
 
     def should_stop(self) -> bool:
-        """Whether the job is unwanted; reads the record at most every `STATUS_INTERVAL` seconds."""
+        """Return whether the attempt should stop; reads the record at most every `STATUS_INTERVAL` seconds."""
         now = time.monotonic()
         if not self.unwanted and now >= self._next_look:
             self._next_look = now + STATUS_INTERVAL
             if os.getppid() != self._parent:
-                os._exit(1)  # orphaned, on systems whose kernel does not end orphans; the reconciler requeues the job
+                os._exit(1)  # orphaned, where the kernel does not kill orphans; the reconciler requeues the job
             self.unwanted = now >= self.deadline or self._status() is not Status.RUNNING
         return self.unwanted
 
     def log(self, text: str) -> None:
-        """Append to the job's log; written with the next progress."""
+        """Append text to the job's log; it is written with the next progress."""
         moment = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         with self._log_lock:
             self._lines += [f"{moment} {line}" for line in text.splitlines()]
 
     def conclude(self, end: Finished | Problem | None) -> str:
-        """Write the final record: the result, the failure, or None for a stop on request.
+        """Record the outcome: the result, the problem, or None for a stop on request. Return the job's status.
 
         Raises
         ------
@@ -180,7 +180,7 @@ class Attempt:
         Raises
         ------
         Interrupted
-            The job is no longer wanted.
+            The attempt should stop.
         StoreUnavailable
             The blob store has not answered for `PATIENCE` seconds.
         """
@@ -195,7 +195,7 @@ class Attempt:
         Raises
         ------
         Interrupted
-            The job is no longer wanted.
+            The attempt should stop.
         StoreUnavailable
             The store has not answered.
         """
@@ -209,7 +209,7 @@ class Attempt:
 
     @property
     def prefix(self) -> str:
-        """Blob prefix of this attempt's artifacts; they become the job's when its record names the prefix."""
+        """Blob prefix of this attempt's artifacts, which are published when the job's record names the prefix."""
         return f"jobs/{self.id}/{self.attempt_id}/artifacts/"
 
     def _status(self) -> Status | None:
@@ -227,9 +227,9 @@ class Attempt:
 def work(
     attempt: Attempt, stored: Stored, directory: Path, *, reconstruct: Callable[..., Finished] | None = None
 ) -> Finished | Problem | None:
-    """Run the job; map every exception to a problem and write its traceback to the log.
+    """Run the job; return its result, the problem that it failed with, or None after a stop on request.
 
-    `reconstruct` replaces `pliant.worker.execution.pipeline.reconstruct`, in tests.
+    Tracebacks of unexpected errors are logged. `reconstruct` replaces `pliant.worker.execution.pipeline.reconstruct` in tests.
     """
     try:
         from pliant.solver import threads_limited
@@ -264,7 +264,7 @@ def work(
 
 @contextlib.contextmanager
 def _repeating(attempt: Attempt, part: str, done: float) -> Iterator[None]:
-    """Repeat the progress of a part that cannot report any: a gigabyte is fetched, read or stored."""
+    """Repeat the progress of a part that reports none itself, such as fetching, reading or storing a gigabyte."""
     reporter = Reporter(attempt.report)
     reporter.part(part, done)
     with reporter.ticking():
@@ -298,7 +298,6 @@ def _reconstruct(
 
 
 def _write_further(attempt: Attempt, stored: Stored, inputs: Path, results: Path) -> Finished:
-    """Write further files of a stored result."""
     from pliant.worker.execution.further_outputs import write_further
 
     file, key = inputs.with_name("result.npz"), stored.result

@@ -28,12 +28,12 @@ from pliant.worker.jobs.finished import Finished
 FILES = {
     "tracks.npz": (
         "application/zip",
-        "The film's tracks (F, P, 2) in its pixels, visibility, confidence, grid, faces, texture coordinates and times.",
+        "The film's tracks (F, P, 2) in film pixels, visibility, confidence, grid, faces, texture coordinates and times.",
     ),
     "contact_sheet.jpg": ("image/jpeg", "The tracks drawn over some frames of the film."),
     frame_strip.NAME: (frame_strip.MEDIA_TYPE, frame_strip.DESCRIPTION),
 }
-"""Files of a film besides those of its reconstruction: media type and description. The last is missing for very long films."""
+"""Files of a film job besides those of the reconstruction: media type and description. Very long films have no frame strip."""
 
 
 def reconstruct_film(
@@ -48,9 +48,9 @@ def reconstruct_film(
     on_progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Finished:
-    """Track, solve, measure and write the files, with the first stage `track`; raises as `reconstruct`.
+    """Track the film, solve, evaluate and write the files. Raises the same errors as `pipeline.reconstruct`.
 
-    `scratch` is an empty folder for the film process; `threads` are for optical flow.
+    The first stage is `track`. `scratch` is an empty folder for the film process; `threads` is the thread count of optical flow.
     """
     kinds_for(options)
     reporter = Reporter(on_progress if on_progress is not None else silent, shares=FILM_SHARES)
@@ -89,7 +89,7 @@ def reconstruct_film(
 
 
 def solving_seconds(frames: int, points: int, options: Options) -> float:
-    """Return the planned time of the solve of a film's tracks, which have the size of its pictures, at a `MachinePace` of 1."""
+    """Return the planned seconds of solving a film's tracks, whose image size is known, at a `MachinePace` of 1."""
     settings = replace(solver_settings(options), image_size=(1.0, 1.0))  # any size: only whether it is known matters
     sheet = tries_isometry(None, settings)
     stages = planned(frames, points, gaussian=settings.gaussian, known_cameras=False, sheet=sheet)

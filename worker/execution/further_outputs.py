@@ -1,4 +1,4 @@
-"""The work of a job that writes further files of a stored result; nothing is solved."""
+"""Run a job that writes further files from a stored result, without solving again."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ def write_further(
     on_progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Finished:
-    """Write the files that a job's options name, from a stored result.
+    """Write the files requested by a job's options from a stored result.
 
     `inputs_file` has the inputs of the job that solved (canonical, or the `tracks.npz` of a film), `result_file` is its
-    `shapes.npz`. Metrics, verdict and warnings of `job`, which writes, are those of the result.
+    `shapes.npz`. The metrics, verdict and warnings in `job` are those of the result.
 
     Raises
     ------
     Interrupted, TimedOut
-        As `reconstruct`.
+        See `pipeline.reconstruct`.
     InvalidInput
         Code damaged_file: a stored file cannot be read back.
     """
@@ -89,12 +89,12 @@ def write_further(
 def read_solution(path: Path, *, y_up: bool) -> Solution:
     """Read the arrays of a `shapes.npz` as a solution.
 
-    How the solver chose is not among them: those numbers are NaN, and no file that is written from a stored result states them.
+    The file does not contain the solver's choices: those fields are NaN, 0 or empty, and files written from a stored result omit them.
 
     Raises
     ------
     InvalidInput
-        Code damaged_file, when it is not a result of ours or was damaged.
+        Code damaged_file: the file was not written by Pliant or is damaged.
     """
     arrays = read_file(path, field="result", limits=OWN_FILES, wanted=_NEEDED | _OPTIONAL)
     missing = sorted(_NEEDED - set(arrays))

@@ -1,4 +1,4 @@
-"""Supervision of one attempt by its worker: heartbeats, reasons to kill it, and its outcome if it recorded none."""
+"""Supervision of one attempt by its worker: heartbeats, reasons to kill it, and an outcome if the attempt recorded none."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Answer = TypeVar("Answer")
 
 
 class Patience:
-    """Retries of calls to an unavailable store within one common time limit."""
+    """Retry calls to an unavailable store, with one time limit for all calls together."""
 
     def __init__(self, seconds: float) -> None:
         self._until = time.monotonic() + seconds
@@ -112,7 +112,7 @@ class Watch:
 
     @property
     def limit(self) -> float:
-        """Return the time limit of the attempt, seconds: the lower of the setting and the job's option; 0: no limit."""
+        """Time limit of the attempt, seconds: the lower of the setting and the job's option; 0: no limit."""
         return min((each for each in (self.settings.time_limit, self._own_limit or 0.0) if each > 0), default=0.0)
 
     def _look(self, now: float) -> None:
@@ -133,9 +133,8 @@ class Watch:
 def finalize(watch: Watch, *, status: int, peak: int, patience: Patience) -> Stored | None:
     """Record the outcome of a job process that ended without recording one; otherwise change nothing.
 
-    Returns the record if it was written. The reason and the last output of the job process are logged before the record becomes
-    final, so the log of a finished job is complete. `status` is as `os.wait4` returns it, `peak` the largest resident size in
-    bytes.
+    Returns the new record, or None if unchanged. Reason and last output of the job process are logged before the record becomes
+    final, so the log of a finished job is complete. `status` is the wait status of `os.wait4`, `peak` the peak resident size, bytes.
 
     Raises
     ------
@@ -164,7 +163,7 @@ def _verdict(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stor
     settings, attempt_id, now = watch.settings, watch.attempt_id, datetime.now(UTC)
 
     def change(stored: Stored) -> Stored:
-        if stored.worker != watch.worker:  # a duplicate delivery must not end the first one
+        if stored.worker != watch.worker:  # a duplicate delivery must not end the original attempt
             raise StaleAttempt(watch.id)
         if watch.reason is Reason.CANCELLED:
             return lifecycle.stop(stored, attempt_id=attempt_id, now=now, retention=settings.retention)
@@ -191,7 +190,7 @@ def _verdict(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stor
 
 
 def _death(watch: Watch, *, status: int, peak: int) -> Problem:
-    """Whether the process died for lack of memory: by the kernel's counters, or by a limit that was nearly reached."""
+    """Return out_of_memory if the kernel counted an OOM kill or the peak is above 90 % of the limit, else worker_lost."""
     killed = _was_killed(status)
     limit = watch.settings.memory_limit
     if (killed and OomKills.now().since(watch.kills)) or (limit > 0 and peak > 0.9 * limit):

@@ -1,4 +1,4 @@
-"""How fast this machine is at the moment, against the core on which the times of the stages were measured."""
+"""Current speed of this machine, relative to the core on which the stage times were measured."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import time
 import numpy as np
 
 SIZE, PIECES = 60, 5
-"""Order of a matrix as in the stage of the cameras for 30 frames, and how often it is inverted for one measurement."""
+"""Order of the matrix, as in the camera stage for 30 frames, and number of inversions per measurement."""
 
 PIECE_SECONDS = 1e-4
-"""Processor seconds of a piece where the solve of a film takes as long as planned. Three solves of 30 and 40 frames with a known
-image size, on an idle machine at half the speed of the plan's core, gave 7.2e-5 to 1.02e-4. The upper end is taken, since the
-threads of the tracker run beside the measurement; chosen on the film of `benchmarks.installation.progress`."""
+"""CPU seconds of one inversion on a machine where solving a film takes as long as planned. Three solves of 30 and 40 frames with a
+known image size, on an idle machine at half the speed of the plan's core, gave 7.2e-5 to 1.02e-4. The upper end is used because
+tracker threads run during the measurement; chosen on the film of `benchmarks.installation.progress`."""
 
 
 class MachinePace:
-    """Mean of the measurements so far: 1 where stages take as long as planned, 2 on a machine that needs twice the time.
+    """Mean ratio of measured to planned time: 1 if stages take as long as planned, 2 if they take twice as long.
 
-    For plans of work that has not begun; during a solve, `Pace` of its stages learns more.
+    It scales plans of work that has not begun; during a solve, `pliant.solver.stages.Pace` is more accurate.
     """
 
     def __init__(self) -> None:
@@ -26,8 +26,8 @@ class MachinePace:
         self._spent, self._pieces = 0.0, 0
 
     def measure(self) -> float:
-        """Measure for half a millisecond; return the mean of all measurements."""
-        self._piece()  # brings code and matrix into the caches
+        """Measure for about half a millisecond; return the mean ratio of all measurements so far."""
+        self._piece()  # warms up the caches
         began = time.thread_time()
         for _ in range(PIECES):
             self._piece()

@@ -1,4 +1,4 @@
-"""A complete job as a plain call from inputs to files, used by `pliant solve` and by the workers."""
+"""Run a complete job, from inputs to files, in one call; used by `pliant solve` and by the workers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pliant.worker.formats import Inputs
 from pliant.worker.jobs.finished import Finished
 
 EXPORT_SECONDS = 1.5e-7
-"""Seconds per frame and point of writing a file whose `share` is 1, measured on a face of 99 frames and 3,000 points."""
+"""Seconds per frame and point to write a file whose `share` is 1, measured on a face of 99 frames and 3,000 points."""
 
 
 def reconstruct(
@@ -33,14 +33,14 @@ def reconstruct(
     should_stop: Callable[[], bool] | None = None,
     solver: Callable[..., Solution] | None = None,
 ) -> Finished:
-    """Solve, measure, and write the files into a directory, which is created if missing.
+    """Solve, evaluate, and write the files into a directory, which is created if missing.
 
     `on_progress` and `should_stop` are called frequently. `solver` replaces `pliant.solver.solve`, in tests.
 
     Raises
     ------
     Interrupted
-        `should_stop` returned True; some files may be written.
+        `should_stop` returned True; some files may have been written.
     TimedOut
         The job took longer than `options.time_limit`.
     InvalidInput
@@ -70,7 +70,7 @@ def solve_and_write(
     """Run `reconstruct` as part of a longer job.
 
     The reporter receives the parts `loading`, `solving` and `exporting`. `spent` (seconds), `earlier` (files in the same
-    directory) and `warnings` are of earlier parts, for the report.
+    directory) and `warnings` come from earlier parts and are included in the report.
     """
     directory.mkdir(parents=True, exist_ok=True)
     size = inputs.tracks.num_frames, inputs.tracks.num_points
@@ -131,7 +131,7 @@ class Halt:
     reason: Interrupted | TimedOut | None = None
 
     def requested(self) -> bool:
-        """Whether the job has to stop."""
+        """Return whether the job has to stop."""
         if self.reason is None and self.should_stop is not None and self.should_stop():
             self.reason = Interrupted()
         if self.reason is None and self.limit is not None and time.monotonic() > self.began + self.limit:

@@ -1,4 +1,4 @@
-"""Progress of a job: one fraction from the steps of its parts, with an estimate of the remaining time."""
+"""Progress of a job: one fraction over all its parts, and an estimate of the remaining time."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from typing import Any
 from pliant.schemas.job import FollowedPoints, Progress
 
 SHARES = {"loading": (0.0, 0.02), "solving": (0.02, 0.85), "exporting": (0.85, 1.0)}
-"""Start and end of each part of a job as fractions of the whole, where no time is known."""
+"""Start and end of each part as fractions of the job, used while no time estimate is available."""
 
 FILM_SHARES = {"track": (0.0, 0.5), "loading": (0.5, 0.51), "solving": (0.51, 0.93), "exporting": (0.93, 1.0)}
 """The same for a film, from the timings of films of a few seconds on two cores."""
 
 WORTH_ESTIMATING = 0.05
-"""Fraction from which the remaining time is extrapolated from the elapsed time."""
+"""Minimum fraction for extrapolating the remaining time from the elapsed time."""
 
 TICK = 1.0
-"""Seconds of silence after which the last progress is repeated, with the time that is left by then."""
+"""Seconds without a report after which the last progress is repeated, with an updated remaining time."""
 
 
 @dataclass(slots=True)
 class Reporter:
     """Combines the progress of parts into one fraction that never decreases.
 
-    Where a part states its remaining seconds, the fraction is the elapsed time over the whole. Otherwise the fraction follows from
-    `shares`, and the remaining time is extrapolated from the elapsed time.
+    If a part reports its remaining seconds, the fraction is the elapsed time divided by the expected total. Otherwise the fraction
+    follows from `shares`, and the remaining time is extrapolated from the elapsed time.
 
     Parameters
     ----------
@@ -39,22 +39,22 @@ class Reporter:
     clock : callable
         Monotonic seconds.
     shares : mapping
-        The parts of the job.
+        Start and end of each part, as fractions of the job.
     """
 
     on_progress: Callable[[Progress], None]
     clock: Callable[[], float] = time.monotonic
     shares: Mapping[str, tuple[float, float]] = field(default_factory=lambda: SHARES)
     export_seconds: float = 0.0
-    """Expected duration of the part `exporting`."""
+    """Expected seconds of the part `exporting`."""
     following_seconds: float = 0.0
-    """Expected duration of everything after the part `track`; 0 where it is not known."""
+    """Expected seconds of everything after the part `track`; 0 if unknown."""
     _began: float | None = None
     _export_began: float | None = None
     _furthest: float = 0.0
     _sent: float = 0.0
     _left: tuple[float, float] | None = None
-    """Seconds, and when they were estimated."""
+    """Remaining seconds, and the clock time of this estimate."""
     _last: dict[str, Any] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -71,10 +71,10 @@ class Reporter:
         seconds_left: float | None = None,
         followed: FollowedPoints | None = None,
     ) -> None:
-        """Report that the share `done` (0 to 1) of a part, a key of `shares`, is done; omitted numbers keep their last value.
+        """Report the completed share `done` (0 to 1) of a part, a key of `shares`; omitted solver numbers keep their last value.
 
-        The stage is the part by default. `seconds_left` is until this part ends. `followed`, the points just tracked, is not
-        repeated later.
+        `stage` defaults to the part. `seconds_left` is the time until this part ends. `followed`, the points just tracked, is
+        sent only once.
         """
         with self._lock:
             now = self.clock()
@@ -100,7 +100,7 @@ class Reporter:
 
     @contextmanager
     def ticking(self) -> Iterator[None]:
-        """Repeat the last progress whenever nothing was reported for `TICK` seconds, from a thread of its own."""
+        """Repeat the last progress from a separate thread whenever nothing was reported for `TICK` seconds."""
         ended = threading.Event()
 
         def repeat() -> None:
@@ -116,7 +116,7 @@ class Reporter:
             thread.join()
 
     def tick(self) -> None:
-        """Repeat the last progress if nothing was reported for `TICK` seconds, with the time that is left by now."""
+        """Repeat the last progress, with an updated remaining time, if nothing was reported for `TICK` seconds."""
         with self._lock:
             now = self.clock()
             if self._began is None or now - self._sent < TICK:
@@ -130,7 +130,7 @@ class Reporter:
         if part == "exporting" and self.export_seconds > 0:
             if self._export_began is None:
                 self._export_began = now
-            # The plan counts less, and the time spent more, the more is done.
+            # The weight shifts from the planned to the elapsed time as the export proceeds.
             return (1 - done) * ((1 - done) * self.export_seconds + now - self._export_began)
         if part in ("track", "loading") and self.following_seconds > 0 and done > 0 and self._began is not None:
             tracking = (now - self._began) * (1 - done) / done if part == "track" else 0.0

@@ -43,7 +43,7 @@ IDLE_WAKE = 5
 """Seconds an idle worker waits for a delivery between heartbeats."""
 
 ALIVE_FOR = 20
-"""Seconds after its last heartbeat that a worker counts as running."""
+"""Seconds for which a worker counts as running after its last heartbeat."""
 
 RSS_UNIT = 1 if sys.platform == "darwin" else 1024
 """Bytes in one unit of `ru_maxrss`."""
@@ -52,7 +52,7 @@ AWAY = (redis.ConnectionError, redis.TimeoutError)
 """Exceptions of an unavailable Redis."""
 
 LEAVE_FOR = 1.0
-"""Seconds that a worker which has put back a job that is too large leaves to the others."""
+"""Seconds that a worker waits after requeuing a job that is too large for it, so that another worker can take the job."""
 
 POLL = 0.05
 """Seconds between checks of a running job process."""
@@ -89,9 +89,9 @@ class PliantWorker(Worker):
     Parameters
     ----------
     connection : Redis
-        For RQ, which waits for deliveries on it.
+        Connection on which RQ waits for deliveries.
     quick : Redis
-        For the heartbeats during a job; its time limit and that of `records` delay supervision of the job.
+        Connection for heartbeats during a job. A hanging store delays supervision by the time limits of `quick` and `records`.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class PliantWorker(Worker):
             logger.warning("delivery %s: %s", job.id, error)
 
     def _leave_to_a_larger(self, job: RqJob) -> bool:
-        """Put a job back that needs more memory than this worker has, if another one has it; True if so."""
+        """Requeue a job that needs more memory than this worker has, if another worker has enough; return True if it was requeued."""
         id, attempt_id = (str(each) for each in (*job.args, "", "")[:2])
         try:
             held = self._records.get(id)
@@ -170,7 +170,7 @@ class PliantWorker(Worker):
                 return False
             memories = self._deliveries.memories()
             if not any(size >= estimate.memory_bytes for name, size in memories.items() if name != self.name):
-                return False  # it may succeed all the same, and fails with a reason if it does not
+                return False  # the estimate may be too high; if it is not, the job fails with a reason
             self._deliveries.remove(attempt_id)
             self._deliveries.push(id, attempt_id)
         except (StoreUnavailable, UnknownJob):
@@ -179,7 +179,7 @@ class PliantWorker(Worker):
         return True
 
     def request_stop(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        """Handle SIGTERM: end if idle; else let the job continue for the grace period, which a second signal ends."""
+        """Handle SIGTERM: exit if idle; otherwise let the job continue for the grace period, which a second signal ends."""
         first = self._stop_by is None
         self._stop_by = time.monotonic() + (self._settings.stop_grace if first else 0.0)
         self._stop_requested = True
@@ -197,18 +197,18 @@ class PliantWorker(Worker):
                 os.kill(self.horse_pid, sig)
 
     def main_work_horse(self, job: RqJob, queue: RqQueue) -> None:
-        """Run as the job process: end with the worker, and write output to the attempt's file only."""
+        """Run the delivery in the job process, which ends with the worker."""
         die_with_parent(int(os.environ["PLIANT_WORKER_PROCESS"]))
         job.settings = self._settings  # type: ignore[attr-defined]
         super().main_work_horse(job, queue)
 
     def setup_work_horse_signals(self) -> None:
-        """Ignore SIGTERM: service managers send it to every process of a service, and the worker stops its job process."""
+        """Ignore SIGTERM and SIGINT, which may be sent to all processes of a service: the worker stops its job process."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
     def fork_work_horse(self, job: RqJob, queue: RqQueue) -> None:
-        """Fork; the parent's id is taken before, since the parent may end at once."""
+        """Fork, after recording the worker's process id: the worker may end before the job process can read it."""
         os.environ["PLIANT_WORKER_PROCESS"] = str(os.getpid())
         super().fork_work_horse(job, queue)
 
@@ -231,7 +231,7 @@ class PliantWorker(Worker):
         self._reap(watch, job, status=status, peak=usage.ru_maxrss * RSS_UNIT)
 
     def _keep_execution(self, job: RqJob) -> None:
-        """Write the job's heartbeat, and RQ's for the delivery: without it RQ abandons every job of more than 90 s."""
+        """Write the worker's heartbeat, and RQ's for the delivery: without it RQ abandons every job of more than 90 s."""
         patient, self.connection = self.connection, self._quick
         try:
             self.maintain_heartbeats(job)
@@ -252,12 +252,12 @@ class PliantWorker(Worker):
         except StoreUnavailable as error:
             logger.warning("job %s: %s; the reconciler will requeue it", watch.id, error)
         finally:
-            with suppress(StoreUnavailable):  # the reconciler removes the files then
+            with suppress(StoreUnavailable):  # otherwise the reconciler removes the files
                 if not patience.retry(lambda: self._elsewhere(watch)):
                     clean_up(self._settings, watch.attempt_id)
 
     def _elsewhere(self, watch: Watch) -> bool:
-        """Whether another worker runs this attempt: then this delivery was a duplicate, and the scratch directory is not ours."""
+        """Return whether another worker runs this attempt: then this delivery is a duplicate and does not own the scratch directory."""
         try:
             held = self._records.get(watch.id)
         except UnknownJob:

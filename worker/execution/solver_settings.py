@@ -1,4 +1,4 @@
-"""The solver's settings of a job's options."""
+"""Solver settings from a job's options."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pliant.solver.settings import Settings
 
 
 def solver_settings(options: Options, *, y_up: bool = False) -> Settings:
-    """Return the solver settings of a job's options; `y_up` as the tracks were read.
+    """Return the solver settings of a job's options; `y_up` is True if y points up in the tracks.
 
     Raises
     ------
@@ -21,7 +21,7 @@ def solver_settings(options: Options, *, y_up: bool = False) -> Settings:
 
 
 def _pair(text: str | None, between: str) -> tuple[float, float] | None:
-    """Return two numbers written with a separator between them."""
+    """Parse two numbers joined by a separator."""
     if text is None:
         return None
     first, second = text.split(between)

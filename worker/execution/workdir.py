@@ -17,7 +17,7 @@ def working_directory(settings: Settings, attempt_id: str) -> Path:
 
 
 def last_words(settings: Settings, attempt_id: str) -> list[str]:
-    """Return the last standard output and error of an ended attempt."""
+    """Return the end of an attempt's standard output and error: at most 100 lines and 16 KiB."""
     file = working_directory(settings, attempt_id) / OUTPUT
     if not file.exists():
         return []

@@ -1,1 +1,1 @@
-"""Films as input: checked when they are submitted, tracked when the job runs, and decoded in a contained process only."""
+"""Films as input: checked when they are submitted, tracked when the job runs, and decoded only in a contained process."""

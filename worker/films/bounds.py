@@ -1,4 +1,4 @@
-"""Limits of one film. The film process, which starts for each film, loads this module without pydantic."""
+"""Limits on one film. Every film process imports this module, so it does not import pydantic."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilmBounds:
-    """Limits of one film; those on playing time and frames are enforced by `pliant.tracking.FilmLimits`."""
+    """Limits on one film; `pliant.tracking.FilmLimits` enforces those on file size, frames, pixels and playing time."""
 
     max_bytes: int = 1 << 30
-    """Size of the film's file, or of all pictures of a zip."""
+    """Size of the film file, or of all pictures in a zip, bytes."""
 
     max_frames: int = 3600
-    """Frames that are tracked."""
+    """Number of tracked frames."""
 
     max_pixels: int = 4096 * 2304
-    """Width × height of a frame."""
+    """Width × height of a frame, pixels."""
 
     max_seconds: float = 600.0
-    """Playing time up to the last frame that is tracked."""
+    """Playing time up to the last tracked frame, seconds."""
 
     check_seconds: float = 30.0
-    """Wall time of the check at submission."""
+    """Wall time of the check at submission, seconds."""
 
     track_seconds: float = 3600.0
-    """Wall time of tracking."""
+    """Wall time of tracking, seconds."""
 
     memory: int = 4 << 30
-    """Address space of the process that decodes."""
+    """Address space of the film process, bytes."""
 
     scratch_bytes: int = 8 << 30
-    """Size of one file that this process writes: the grey frames of the film, packed without loss."""
+    """Size of one file written by that process, such as the losslessly packed grey frames of the film, bytes."""
 
     @classmethod
     def of(cls, settings: Settings, *, max_bytes: int = 1 << 30) -> FilmBounds:
-        """Return the bounds that an installation sets; a job's own limit on memory holds for its film, too."""
+        """Return the bounds of an installation; the memory limit of jobs also applies to the film process."""
         memory = min(settings.film_memory, settings.memory_limit or settings.film_memory)
         return cls(
             max_bytes=max_bytes, max_frames=settings.film_frames, max_pixels=settings.film_pixels,

@@ -33,16 +33,16 @@ PROGRESS_EVERY = 0.2
 """Minimum seconds between two lines of progress."""
 
 FOLLOWED_POINTS = 150
-"""Points that are shown while tracking runs: about 1.5 kB in a record that is rewritten twice a second."""
+"""Maximum number of points shown while tracking runs: about 1.5 kB in a record that is rewritten twice a second."""
 
 SHARES = {"read": (0.0, 0.15), "locate": (0.15, 0.25), "track": (0.25, 1.0)}
-"""Start and end of each stage of the tracker as fractions of the whole, from typical timings."""
+"""Start and end of each stage of the tracker, as fractions of the tracking time, from typical timings."""
 
 LEAST_FRAMES = 3
 """Minimum number of frames of a reconstruction."""
 
 PICTURE_SIDE, PICTURE_QUALITY = 800, 80
-"""Longest side of the first frame that is sent along, pixels, and its JPEG quality: 0.1 MB, 0.5 MB at most."""
+"""Longest side in pixels and JPEG quality of the first frame in the answer: about 0.1 MB, at most 0.5 MB."""
 
 FULL = ("Insufficient memory", "can't start new thread")
 """Messages of OpenCV and Python when the address space is exhausted."""
@@ -66,7 +66,7 @@ def _answer(request: dict[str, Any]) -> str:
             hint="Install OpenCV beside service and worker (pip install 'pliant[film]'), or send tracks.",
         ) from error  # fmt: skip
     if request["action"] == "track" or request["estimate"]:
-        import_module("pliant.tracking.track")  # before the limit of memory, which is for the film
+        import_module("pliant.tracking.track")  # before the memory limit, which is meant for the film
     bounds = FilmBounds(**request["bounds"])
     seconds = bounds.check_seconds if request["action"] == "check" else bounds.track_seconds * request["threads"]
     limit_process(
@@ -180,7 +180,7 @@ def _region(request: dict[str, Any]) -> Path | list[list[float]] | None:
 
 
 def _reporter(target: int, size: tuple[int, int]) -> Callable[[TrackingStep], None]:
-    """Return a callback that writes the completed share, and points, to a descriptor, at most every `PROGRESS_EVERY` seconds."""
+    """Return a callback that writes progress and tracked points to a descriptor, at most every `PROGRESS_EVERY` seconds."""
     after = 0.0
 
     def report(step: TrackingStep) -> None:
@@ -198,14 +198,14 @@ def _reporter(target: int, size: tuple[int, int]) -> Callable[[TrackingStep], No
 
 
 def _observations(step: TrackingStep) -> list[int] | None:
-    """Return the numbers of frames and points that the tracks will have, once they are known; a few points may be dropped at the end."""
+    """Return the expected numbers of frames and points, None while unknown; a few points may be dropped at the end."""
     if step.followed is None or step.total is None:
         return None
     return [(step.total + 1) // 2, len(step.followed.points)]
 
 
 def _followed(step: TrackingStep, size: tuple[int, int]) -> dict[str, Any] | None:
-    """Return at most `FOLLOWED_POINTS` of the visible points of the frame just tracked, as the schema `FollowedPoints`."""
+    """Return up to `FOLLOWED_POINTS` visible points of the frame just tracked, in the schema `FollowedPoints`."""
     if step.followed is None:
         return None
     points = step.followed.points[step.followed.visible]
@@ -217,7 +217,7 @@ def _followed(step: TrackingStep, size: tuple[int, int]) -> dict[str, Any] | Non
 
 
 def _refused(error: FilmError, request: dict[str, Any]) -> InvalidInput:
-    """Return the error with the job's field names, and with the user's names of the files instead of paths."""
+    """Return the error with the job's field names, and with the user's file names instead of paths."""
     field = f"options.{error.field}" if error.field in OPTIONS else error.field
     if field == "region" and request["region"] is None and request["options"]["region_polygon"] is not None:
         field = "options.region_polygon"
@@ -229,14 +229,14 @@ def _refused(error: FilmError, request: dict[str, Any]) -> InvalidInput:
 
 
 def _renamed(got: str, path: Path, name: str) -> str:
-    """Return what was given, with the user's name of a file where its path, or the name of that, begins it or follows "in"."""
+    """Replace a file's path or name by the user's name for it, at the start of the text or after "in"."""
     start, own, rest = got.replace(f"{path.parent}{os.sep}", "").partition(path.name)
     named = own != "" and (start == "" or start.endswith(" in ")) and re.match(r"\w", rest) is None
     return f"{start}{name}{rest}" if named else f"{start}{own}{rest}"
 
 
 def _for_want_of_memory(error: Exception) -> bool:
-    """Translate exceeded limits on memory or file size to `InvalidInput`."""
+    """Return whether the error is due to the limit on memory or file size."""
     full = isinstance(error, OSError) and error.errno in (errno.ENOMEM, errno.EFBIG)
     return isinstance(error, MemoryError) or full or any(sign in str(error) for sign in FULL)
 

@@ -1,4 +1,4 @@
-"""The example film that the page offers: rendered on request, once for each process."""
+"""The example film of the web page, rendered on request and once per process."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def available() -> bool:
 
 @cache
 def film() -> bytes:
-    """Return the film; takes a few seconds of computing the first time."""
+    """Return the film's bytes; the first call takes a few seconds."""
     from pliant.tracking.rendering.example_film import write_example_film
 
     with TemporaryDirectory(prefix="pliant-example-") as folder:
@@ -27,7 +27,7 @@ def film() -> bytes:
 
 @cache
 def region() -> tuple[tuple[float, float], ...]:
-    """Return the corners of the object in the film's first frame, for the option `region_polygon`."""
+    """Return the corners of a polygon around the object in the film's first frame, for the option `region_polygon`."""
     from pliant.tracking.rendering.example_film import example_region
 
     return tuple((x, y) for x, y in example_region())

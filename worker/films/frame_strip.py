@@ -1,9 +1,9 @@
 """Small pictures of the tracked frames: `film_frames.bin`, which the web page shows beside the mesh.
 
-Browsers cannot be relied on to decode a film, nor to show exactly the frame that a track belongs to; JPEGs they can.
+Browsers may fail to decode a film or to show the exact frame of a track; they all decode JPEGs.
 
 Layout, little-endian: `b"PLIANTFF"`, uint32 version, uint32 length of the header, the header as JSON in UTF-8
-(`version`, `width` and `height` of the film in pixels, `offsets` of the F pictures and of the file's end), the pictures.
+(`version`, `width` and `height` of the film in pixels, `offsets` of the F pictures and of the end of the file), the pictures.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ DESCRIPTION = "Small pictures of the tracked frames, which the web page shows be
 MAGIC = b"PLIANTFF"
 VERSION = 1
 STRIP_SIDE = 480
-"""Of a picture, pixels: about as large as the page shows it."""
+"""Longest side of a picture, pixels: about its size on the page."""
 
 MOST_BYTES = 40_000_000
-"""Larger files (about 2,000 frames) would make the page wait; such films have none."""
+"""Maximum size of the file, bytes, reached at about 2,000 frames. Longer films have no strip, because it would delay the page."""
 
 QUALITY = 80
-"""JPEG quality: no visible blocks at this size, about 20 kB a picture."""
+"""JPEG quality: no visible blocks at this size, about 20 kB per picture."""
 
 
 def write_frames(film: Film, indices: NDArray[np.int64], path: Path) -> bool:
-    """Decode a film once more and write the pictures of some of its frames: `indices (F,)`, ascending, from 0 in the whole film.
+    """Decode a film again and write pictures of its frames `indices (F,)`, ascending, counted from 0 in the complete film.
 
-    Returns False, and writes no file, where the pictures take more than `MOST_BYTES` or not all frames are found again.
+    Returns False and writes no file if the pictures exceed `MOST_BYTES` or a frame is missing.
     """
     from pliant.tracking.contact_sheet import small_jpeg
 
@@ -57,10 +57,10 @@ def write_frames(film: Film, indices: NDArray[np.int64], path: Path) -> bool:
 
 
 def packed(pictures: Iterable[bytes], size: tuple[int, int]) -> bytes:
-    """Return the file of pictures of a film of `size` (width, height) pixels."""
+    """Return the bytes of the file, from JPEGs of a film of `size` (width, height) pixels."""
     parts = list(pictures)
     ends = np.cumsum([0, *map(len, parts)])
-    # The offsets' own digits decide where the pictures begin: a header of fixed length settles that.
+    # The offsets depend on the header's length, and so on their own digits: padding to a fixed length avoids this.
     room = 200 + 12 * len(ends)
     header = {"version": VERSION, "width": size[0], "height": size[1], "offsets": (16 + room + ends).tolist()}
     text = json.dumps(header).encode().ljust(room)

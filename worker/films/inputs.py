@@ -1,4 +1,4 @@
-"""The inputs of a solve from a tracked film."""
+"""Solver inputs from a tracked film."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TEXTURE_ARRAYS = frozenset(("template_image", "uv"))
 
 
 def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
-    """Read the `tracks.npz` of a film as the inputs of a solve: points in the film's pixels, y down, and their grid as mesh.
+    """Read the `tracks.npz` of a film as solver inputs: points in the film's pixels, y down, and their grid as mesh.
 
     The file is validated like an uploaded one.
 

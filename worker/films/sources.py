@@ -1,4 +1,4 @@
-"""A film and the region to track, as files, or stored together as the inputs of a job."""
+"""A film and the region to track, as separate files or stored together as the inputs of a job."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class FilmSource:
     """A film, a zip of pictures, or (on the command line) a folder of pictures."""
 
     region: Path | None = None
-    """Mask picture of the film's size; None: the option `region_polygon`, or the whole picture."""
+    """Mask picture of the film's size; None: the option `region_polygon`, or the complete frame."""
 
     film_name: str = ""
-    """The user's name of the film, for messages; empty: that of its path."""
+    """The user's file name of the film, for messages; empty: the name in its path."""
 
     region_name: str = ""
-    """The user's name of the mask picture, likewise."""
+    """The same for the mask picture."""
 
     @property
     def names(self) -> dict[str, str]:
@@ -44,7 +44,7 @@ class FilmSource:
 
 
 def looks_like_film(path: Path) -> bool:
-    """Whether a command-line argument is a film rather than tracks: by content, then by name."""
+    """Return whether a command-line argument is a film rather than tracks, by content, then by name."""
     if path.is_dir():
         return True
     try:
@@ -87,7 +87,7 @@ def save_source(source: FilmSource, interpretation: Interpretation, target: Path
 
 
 def is_source(path: Path) -> bool:
-    """Whether `save_source` wrote this file; False for other inputs of a job."""
+    """Return whether `save_source` wrote this file; False for other inputs of a job."""
     try:
         with zipfile.ZipFile(path) as archive:
             return _MARK in archive.namelist()
@@ -101,7 +101,7 @@ def open_source(path: Path, folder: Path) -> FilmSource:
     Raises
     ------
     InvalidInput
-        Code damaged_file: `save_source` did not write this file, or it was damaged.
+        Code damaged_file: `save_source` did not write this file, or it is damaged.
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:

@@ -54,13 +54,13 @@ class FilmFacts(BaseModel):
     """Width over height of a stored pixel; `width` and `height` count square pixels."""
 
     points: Count = 0
-    """Points that tracking would follow, about; 0 if it was not estimated."""
+    """Estimated number of tracked points; 0 if not estimated."""
 
     track_seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
-    """Seconds that tracking would take on this machine, about; 0 if it was not estimated."""
+    """Estimated seconds of tracking on this machine; 0 if not estimated."""
 
     first_frame: Annotated[str, Field(max_length=1 << 20, pattern=r"^[A-Za-z0-9+/]*={0,2}$")] = ""
-    """First frame of the complete film as a JPEG in base64; empty if it was not wanted."""
+    """First frame of the complete film as a JPEG in base64; empty if not requested."""
 
 
 class Tracked(BaseModel):
@@ -81,10 +81,9 @@ def check_film(
     picture: bool = False,
     threads: int = 1,
 ) -> FilmFacts:
-    """Open a film and its region without tracking it; takes seconds, whatever the film's length.
+    """Open a film and its region without tracking it; takes seconds, regardless of the film's length.
 
-    With `estimate` it also estimates how many points would be tracked, and the time with so many threads; `picture` returns the
-    first frame.
+    `estimate` adds the expected number of points and the tracking time on `threads` threads; `picture` adds the first frame.
 
     Raises
     ------
@@ -102,7 +101,7 @@ def check_film(
 OnProgress = Callable[[float, tuple[int, int] | None, FollowedPoints | None], None]
 
 MOST = 1 << 24
-"""Largest number of frames, and of points, that is believed."""
+"""Maximum number of frames or points accepted from the film process."""
 
 
 def track_film(
@@ -115,10 +114,10 @@ def track_film(
     on_progress: OnProgress | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Tracked:
-    """Track a film; `tracks.npz` and `contact_sheet.jpg` are then in the scratch folder, which must be empty.
+    """Track a film; write `tracks.npz`, `contact_sheet.jpg` and unless too large `film_frames.bin` to the empty scratch folder.
 
-    `on_progress` gets the completed share in [0, 1], the numbers of frames and points where they are known, and the points that
-    were just tracked, if any. `should_stop` is called ten times a second; the film process is killed once it returns True.
+    `on_progress` receives the completed share in [0, 1], the numbers of frames and points if known, and the points just tracked,
+    if any. `should_stop` is called ten times a second; the film process is killed once it returns True.
 
     Raises
     ------
@@ -141,7 +140,7 @@ def track_film(
 
 
 def believed_size(stated: object) -> tuple[int, int] | None:
-    """Return the numbers of frames and points that the film process states; None for anything else, since the process is not trusted."""
+    """Return the frame and point counts reported by the film process, None if invalid, since the process is not trusted."""
     match stated:
         case [int(frames), int(points)] if 0 < frames <= MOST and 0 < points <= MOST:
             return frames, points
@@ -149,7 +148,7 @@ def believed_size(stated: object) -> tuple[int, int] | None:
 
 
 def _followed(stated: object) -> FollowedPoints | None:
-    """Take over points that the film process states; None for anything else."""
+    """Return the points reported by the film process, None if invalid."""
     try:
         return FollowedPoints.model_validate(stated)
     except ValidationError:
@@ -170,7 +169,7 @@ def described(facts: FilmFacts, options: Options) -> Interpretation:
 
 
 def film_options(options: Options, facts: FilmFacts) -> Options:
-    """Return the options with the picture's size, and the frame rate if the job gives none, from the film."""
+    """Return the options with the film's image size, and with its frame rate unless the job sets one."""
     known: dict[str, Any] = {"image_size": f"{facts.width}x{facts.height}"}
     if "fps" not in options.model_fields_set:
         known["fps"] = facts.fps
@@ -214,7 +213,7 @@ def _answer(kind: type[Answer], ended: Ended, bounds: FilmBounds, seconds: float
         try:
             return kind.model_validate_json(ended.answer)
         except ValidationError:
-            raise damaged("film", "a film that confuses its decoder") from None
+            raise damaged("film", "a film that its decoder cannot read consistently") from None
     raise _fault(ended, bounds, seconds)
 
 
@@ -222,7 +221,7 @@ def _fault(ended: Ended, bounds: FilmBounds, seconds: float) -> Exception:
     if ended.code == REFUSED:
         parts = refusal_in(ended)
         if parts is None:
-            return damaged("film", "a film that confuses its decoder")
+            return damaged("film", "a film that its decoder cannot read consistently")
         del parts["choices"]
         return InvalidInput(parts.pop("code"), **parts)
     if ended.overdue or ended.code == -signal.SIGXCPU:

@@ -18,11 +18,11 @@ from pliant.worker.formats.texture import Texture
 
 VERSION = 1
 OWN_FILES = Limits(max_bytes=1 << 36)
-"""Limits of files that this package wrote: they were checked when they were made."""
+"""Limits for files that this package wrote; their content was checked before writing."""
 
 
 def save_inputs(inputs: Inputs, path: Path) -> None:
-    """Write the canonical npz. Values that single precision or a byte holds exactly are stored so, to halve the file."""
+    """Write the canonical npz; values that a byte or single precision holds exactly are stored that way, to halve the file."""
     arrays: Arrays = {
         "version": np.array(VERSION),
         "points": _narrow(inputs.tracks.points),

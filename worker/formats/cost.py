@@ -1,10 +1,10 @@
-"""What a job will need, estimated from its size before it runs: memory of its process, and time.
+"""Estimate a job's memory and time from its size before it runs.
 
-Memory is a constant for the interpreter and the libraries, and a share for each of the F·P observations, since every array of the
-solver and of the exporters is linear in them. Time is a share for each frame, for cameras and prior, and one for each observation.
+Memory is a constant for the interpreter and the libraries plus an amount per observation (F·P), since every array of the solver and of the
+exporters is linear in them. Time is a constant plus an amount per frame, for cameras and prior, and an amount per observation.
 
 Basis: whole jobs with the default options and outputs on one core, gallery faces (`python -m benchmarks.installation.cost`). The constants
-were chosen on the first three sizes; the others check them:
+were chosen on the first three sizes; the others are checks:
 
     frames × points   peak, MB   estimate   processor, s   estimate
     10 × 500               111        112            2.4        1.8
@@ -17,7 +17,7 @@ were chosen on the first three sizes; the others check them:
     10 × 20,000            185        180            3.3        3.4
     50 × 20,000            448        460           14.2       15.0
 
-With other options the solver alone, processor s (estimate), the first size chosen on:
+With other options, the solver alone, processor s (estimate); the constants were chosen on the first size:
 
     frames × points   smooth prior   given rotations   both
     50 × 500             2.4 (3.0)         2.0 (3.0)   .4 (1.0)
@@ -25,8 +25,8 @@ With other options the solver alone, processor s (estimate), the first size chos
     100 × 500            5.2 (5.4)         4.4 (5.4)
     30 × 5,000           2.1 (3.1)         2.2 (3.1)   .8 (1.9)
 
-With blocks that overlapped more, the solver alone took 11.6 GB and 520 processor seconds for 100 × 1,000,000, estimated at 17 GB and
-814 s. Not covered: points seen in few frames, which take 80 bytes times the square of their number; and time with other options.
+With blocks of larger overlap, the solver alone took 11.6 GB and 520 processor seconds for 100 × 1,000,000, estimated at 17 GB and 814 s.
+Not covered: sparsely observed points, which take 80 bytes times the square of their number; and time with other options.
 """
 
 from __future__ import annotations
@@ -36,28 +36,27 @@ from pliant.schemas.options import Options
 from pliant.solver.limits import BLOCK_OBSERVATIONS, LEARNED_FRAMES
 
 LIBRARIES = 110_000_000
-"""Bytes of a job process before it has read its inputs."""
+"""Bytes of a job process before it reads its inputs."""
 
 BYTES = {"gaussian": 350, "smooth": 250, "smooth+low_rank": 350}
-"""Bytes for each observation, by prior: 230 to 340, 150 to 220 and 330 were measured in whole jobs of 200,000 to 1.2 million."""
+"""Bytes per observation, by prior: 230 to 340, 150 to 220 and 330 were measured in whole jobs of 200,000 to 1.2 million observations."""
 
 BEYOND = 150
-"""Bytes for each observation beyond those solved at once, of which only tracks and results are held: 80 in the solver, 140 while files are
-written, measured in a job whose blocks were made small."""
+"""Bytes per observation beyond those solved at once, of which only tracks and results are kept: 80 in the solver, 140 while files are
+written, measured in a job with small blocks."""
 
 SECONDS = 0.5
-"""Processor seconds of a job that is as small as can be."""
+"""Processor seconds of the smallest job."""
 
 LEARNING = {(True, False): 0.13, (True, True): 0.045, (False, False): 0.045, (False, True): 0.005}
-"""Processor seconds for each frame that cameras and prior are learned from: by whether the prior is learned, and whether rotations are
-given."""
+"""Processor seconds per frame from which cameras and prior are learned, by (whether the prior is learned, whether rotations are given)."""
 
 MICROSECONDS = 8.0
-"""Processor time for each observation."""
+"""Processor time per observation."""
 
 
 def estimated(num_frames: int, num_points: int, options: Options, *, has_rotations: bool = False) -> Estimate:
-    """Estimate what a job of this size needs; `has_rotations` where the cameras are given."""
+    """Estimate what a job of this size needs; `has_rotations` is true if the cameras are given."""
     observations = num_frames * num_points
     learns = options.prior == "gaussian" and options.method == "robust" and options.preset == "auto"
     at_once = int(min(observations, _largest_block(options)))
@@ -69,7 +68,7 @@ def estimated(num_frames: int, num_points: int, options: Options, *, has_rotatio
 
 
 def largest_that_fits(memory: int, num_frames: int, num_points: int, options: Options) -> tuple[int, int]:
-    """Return how many points of these frames, and how many frames of these points, fit into so many bytes."""
+    """Return the most points at this number of frames, and the most frames at this number of points, that fit into `memory` bytes."""
     left, each, block = max(0, memory - LIBRARIES), BYTES[options.prior], _largest_block(options)
     observations = left // each
     if observations > block:
@@ -78,7 +77,7 @@ def largest_that_fits(memory: int, num_frames: int, num_points: int, options: Op
 
 
 def _largest_block(options: Options) -> float:
-    """Return the observations that are solved at once: all with a prior on the rank of all points together."""
+    """Return the maximum number of observations solved at once; unlimited with the low-rank prior and the pseudo-inverse."""
     return (
         float("inf") if options.prior == "smooth+low_rank" or options.method == "pseudo_inverse" else BLOCK_OBSERVATIONS
     )

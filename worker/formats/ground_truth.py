@@ -47,7 +47,7 @@ def read_truth(path: Path | None, understood: Understood, *, limits: Limits) -> 
     Raises
     ------
     InvalidInput
-        Code missing_array, when a file of its own has none.
+        Code missing_array, if a separate file contains no true shapes.
     """
     if path is None:
         return _truth_of(understood.arrays, understood)
@@ -65,7 +65,7 @@ def read_truth(path: Path | None, understood: Understood, *, limits: Limits) -> 
 
 
 def read_rotations(path: Path, *, num_frames: int, frames: NDArray[np.intp], limits: Limits) -> KnownCamera:
-    """Known cameras: `rotations` `(F, 2|3, 3)`, `(2F, 3)`, `(3, 3, F)` …, and optionally `scales` `(F,)`; those of `frames` are kept.
+    """Read known cameras: `rotations` `(F, 2|3, 3)`, `(2F, 3)`, `(3, 3, F)` …, and optionally `scales` `(F,)`; keep those of `frames`.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def as_rotations(array: NDArray[np.generic], num_frames: int) -> NDArray[np.gene
 
 
 def as_shapes(array: NDArray[np.generic], understood: Understood) -> tuple[NDArray[np.generic], list[str]]:
-    """Return true shapes as `(F, P, 3)`, and the evidence where the array could be read in several ways."""
+    """Return true shapes as `(F, P, 3)`, and notes with the evidence if several layouts fit the array."""
     frames, count = understood.points.shape[:2]
     found: list[tuple[str, NDArray[np.generic]]] = []
     if array.ndim == 2:
@@ -137,7 +137,7 @@ def as_shapes(array: NDArray[np.generic], understood: Understood) -> tuple[NDArr
 
 
 def unexplained(shapes: NDArray[np.generic], points: NDArray[np.generic]) -> float:
-    """Share of the tracks' extent that no affine camera of each frame explains from the shapes; the median over some frames."""
+    """Return the share of the tracks' extent that no affine camera per frame explains from the shapes; median over some frames."""
     chosen = np.unique(np.linspace(0, len(points) - 1, COMPARED_FRAMES).round().astype(int))
     shares = []
     for frame in chosen:
@@ -155,7 +155,7 @@ def unexplained(shapes: NDArray[np.generic], points: NDArray[np.generic]) -> flo
 def _matrix_readings(
     array: NDArray[np.generic], num_frames: int, heights: tuple[int, ...], width: int
 ) -> Iterator[tuple[str, NDArray[np.generic]]]:
-    """Every `(F, k, N)` that a matrix of kF rows and N columns can be."""
+    """Yield every `(F, k, N)` that a matrix of kF rows and N columns, or its transpose, can represent."""
     for matrix in (array, array.T):
         for height in heights:
             if matrix.shape == (height * num_frames, width):

@@ -33,7 +33,7 @@ LARGE = 16 << 20
 """Bytes of arrays, as the files declare them, above which the isolated reader is used."""
 
 GROWTH = {b"MATLAB": 1032, b"\x89PNG": 8 * 1032}
-"""Maximum expansion of a byte: 1032 by deflate, times 8 bytes for a pixel's point index."""
+"""Maximum expansion of a byte: 1032 by deflate, for masks times 8 bytes for a pixel's point index."""
 
 TEXT = 8
 """Maximum expansion of a byte of text or of a mesh file."""

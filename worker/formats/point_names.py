@@ -1,6 +1,6 @@
 """Names of points, as pose trackers export them: body parts, nodes of a skeleton, landmarks.
 
-Between processes and in stored inputs they are one array of bytes: UTF-8, one name a line.
+Between processes and in stored inputs, names are one array of bytes: UTF-8, one name per line.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from pliant.worker.formats.errors import damaged
 ARRAY = "point_names"
 
 MAX_POINT_NAME = 100
-"""Characters of a name; longer ones are cut off."""
+"""Maximum characters of a name; longer names are truncated."""
 
 LISTED_NAMES = 4
-"""Names that a note lists."""
+"""Number of names that a note lists."""
 
 POSE = (
     "nose", "left_eye_inner", "left_eye", "left_eye_outer", "right_eye_inner", "right_eye", "right_eye_outer", "left_ear", "right_ear",
@@ -34,20 +34,20 @@ HAND = (
     *(f"{finger}_{joint}" for finger in _FINGERS for joint in ("mcp", "pip", "dip", "tip")),
 )  # fmt: skip
 FACE, IRISES = (tuple(f"face_{index}" for index in range(count)) for count in (468, 478))
-"""The vertices of MediaPipe's face mesh, without and with irises: it documents their numbers only, and groups of them such as the lips."""
+"""Vertices of MediaPipe's face mesh, without and with irises. Its documentation gives only their numbers, and groups such as the lips."""
 
 MEDIAPIPE = {len(names): names for names in (POSE, HAND, FACE, IRISES)}
-"""Names of MediaPipe's landmarks by their number, from its documentation: exports have none. The 543 of the holistic model have no
-documented order, and so no names."""
+"""Names of MediaPipe's landmarks by their number, from its documentation, since exports have none. The 543 landmarks of the holistic model
+have no documented order and therefore no names."""
 
 
 def one_line(text: str) -> str:
-    """Return a text on one line: what cannot be printed counts as space, and spaces are single."""
+    """Return a text on one line: characters that cannot be printed become spaces, and runs of spaces become one."""
     return " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
 
 
 def found(names: Sequence[str]) -> dict[str, NDArray[np.generic]]:
-    """Return what a reader hands on of the names in a file: nothing if none of them says more than a number."""
+    """Return the names in a file as a named array; nothing if every name is blank or a number."""
     lines = [_clean(name) for name in names]
     return {} if all(line == "" or line.isdecimal() for line in lines) else {ARRAY: pack(lines)}
 
@@ -58,12 +58,12 @@ def pack(names: Sequence[str]) -> NDArray[np.uint8]:
 
 
 def stated(array: NDArray[np.generic], count: int) -> tuple[str, ...]:
-    """Return the names that a NumPy array states, each on one line.
+    """Return the names in a NumPy array of strings, each on one line.
 
     Raises
     ------
     InvalidInput
-        Codes wrong_shape, damaged_file: not one name for each of `count` points, or texts that are not Unicode.
+        Codes wrong_shape, damaged_file: not one name for each of `count` points, or strings that are not Unicode.
     """
     field = f"tracks.{ARRAY}"
     if array.shape != (count,):
@@ -79,7 +79,7 @@ def stated(array: NDArray[np.generic], count: int) -> tuple[str, ...]:
 
 
 def unpack(array: NDArray[np.generic] | None, count: int) -> tuple[str, ...] | None:
-    """Return the names in an array; None where there is none, or it does not name so many points."""
+    """Return the names in a packed array; None if there is none, or if it does not hold `count` names."""
     if array is None or array.dtype != np.uint8:
         return None
     names = tuple(_clean(line) for line in array.tobytes().decode("utf-8", "replace").split("\n"))

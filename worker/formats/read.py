@@ -39,9 +39,9 @@ def read_inputs(
 ) -> Inputs:
     """Read, check and interpret the files of one job; files are recognised by content, not by name.
 
-    `mesh` is a file whose vertex i is point i, a grid size `"ROWSxCOLUMNS"` or `"none"`; by default a mesh is generated. The
-    truth, used for metrics only, and the rotations, used instead of estimated cameras, are for all frames and points of the
-    tracks: `frames`, `stride` and `max_points` select from them as well. Options such as `layout` take precedence over detection.
+    `mesh` is a file whose vertex i is point i, a grid size `"ROWSxCOLUMNS"` or `"none"`; by default a mesh is generated. Ground
+    truth (for metrics only) and rotations (instead of estimated cameras) cover all frames and points of the tracks: `frames`,
+    `stride` and `max_points` select from them as well. Options such as `layout` take precedence over detection.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def read_inputs(
 
 
 def _stated(film: FilmTracks, selection: Selection) -> dict[str, Any]:
-    """Picture size and rate of the chosen frames, as the interpretation gives them."""
+    """Return the picture size, and the frame rate of the selected frames, for the interpretation."""
     step = float(np.median(np.diff(selection.frames)))
     return {"image_size": f"{film.image_size[0]}x{film.image_size[1]}", "fps": film.fps / step}
 
@@ -147,7 +147,7 @@ def _check_size(points: NDArray[np.generic], limits: Limits) -> None:
 
 def _check_range(points: NDArray[np.generic], visible: NDArray[np.float64] | None) -> None:
     if points.dtype.itemsize <= 2:
-        return  # such numbers end at 65,504
+        return  # 16-bit numbers are within the limit
     far = ((points > MAX_COORDINATE) | (points < -MAX_COORDINATE)).any(axis=2) & np.isfinite(points).all(axis=2)  # type: ignore[operator]
     if visible is not None:
         far &= visible > 0

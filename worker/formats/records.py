@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pliant.solver import InvalidInput, KnownCamera, Mesh, Tracks
 
-if TYPE_CHECKING:  # a contained child needs none of it
+if TYPE_CHECKING:  # not needed in the sandbox process
     from pliant.schemas.job import Interpretation
     from pliant.worker.formats.texture import Texture
 
@@ -118,7 +118,7 @@ def _true_points(shapes: ArrayLike, like: tuple[int, int]) -> NDArray[np.float64
     if not (np.ptp(points, axis=1) > 0).any(axis=1).all():
         raise InvalidInput(
             "no_extent", field="ground_truth.shapes",
-            expected="points that differ in every frame", got="a frame whose points are all one",
+            expected="points that differ in every frame", got="a frame whose points all coincide",
             hint="Omit the ground truth if it is not known.",
         )  # fmt: skip
     return points

@@ -63,7 +63,7 @@ class Texture:
         return replace(self, uv=self.uv[points])
 
     def colours(self) -> NDArray[np.float64]:
-        """Colours `(P, 3)` of the points, sRGB in [0, 1]: the picture at their places, bilinearly interpolated."""
+        """Return the colours `(P, 3)` of the points, sRGB in [0, 1], interpolated bilinearly in the picture."""
         from PIL import Image
 
         with Image.open(io.BytesIO(self.jpeg)) as image:

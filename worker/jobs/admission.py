@@ -1,4 +1,4 @@
-"""Admission: a job whose estimated memory no worker has is refused when it is submitted, with what would fit."""
+"""Admission control: reject a job that needs more memory than any worker has, and suggest sizes that fit."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pliant.worker.formats.cost import largest_that_fits
 
 
 def check_fits(interpretation: Interpretation, options: Options, memories: Iterable[int]) -> None:
-    """Check that a worker has the memory that a job is estimated to need.
+    """Check that at least one worker has the estimated memory of a job.
 
-    `memories` are the bytes that a job may take on each running worker; where none is known, every job passes.
+    `memories` are the bytes available to a job on each running worker; if none is known, every job passes.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What an attempt leaves behind when its job succeeds."""
+"""The result of a successful attempt."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class Finished:
     """Outcome of a job and the files in its directory."""
 
     metrics: dict[str, float]
-    """Every metric for which the inputs suffice and that is finite, by its documented name."""
+    """All finite metrics that the inputs allow, by their documented names."""
 
     outcome: str
     """Outcome of the solver: `converged`, `max_reweightings` or `rejected`."""
@@ -39,4 +39,4 @@ class Finished:
     """A sentence with the expected error and the evidence for depth."""
 
     camera_sentence: str | None = None
-    """The camera model, and of a perspective camera focal length and field of view."""
+    """The camera model, with focal length and field of view if it is perspective."""

@@ -1,4 +1,4 @@
-"""Further files of a finished job: a job of its own that writes them from the stored result, without solving again."""
+"""Further files of a finished job: a new job writes them from the stored result, without solving again."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from pliant.worker.records import Stored
 
 RESULT = "shapes.npz"
 TRACKS = "tracks.npz"
-"""File of a film's job that holds what its tracks were solved from."""
+"""File of a film job with the tracks that were solved."""
 
 
 def make_outputs(
     jobs: Jobs, id: str, request: OutputRequest, *, idempotency_key: str | None = None
 ) -> tuple[Job, bool]:
-    """Queue a job that writes further files of a result; return it, and whether it is new.
+    """Queue a job that writes further files of a result; return the job, and whether it is new.
 
-    The new job has copies of what it needs, so the first one may be deleted meanwhile; it counts against the same limits as every
-    other job. The same request again returns the same job; after one that failed or was cancelled it makes one more, unless it
-    has the same key.
+    The new job has its own copies of inputs and result, so the original may be deleted meanwhile. It counts against the usual
+    limits. A repeated request returns the same job, except that a request without a key creates another job if the earlier one
+    failed or was cancelled.
 
     Raises
     ------
     Conflict
         The key belongs to a different request.
     InvalidInput
-        A file cannot be written in this installation, or not in this size.
+        A file cannot be written in this installation, or not at this size.
     InvalidRequest
         The key is malformed.
     NotAllowedNow
-        The job has no result, or holds further files itself.
+        The job has no result, or only writes further files itself.
     QuotaExceeded, TooManyQueued
-        As for a submission.
+        See `Jobs.submit`.
     UnknownJob
         There is no such job, or it was deleted meanwhile.
     """
@@ -63,20 +63,20 @@ def make_outputs(
 
 
 def _check(stored: Stored, submission: Submission) -> None:
-    """Check that there is a result, and that the files can be written of it."""
+    """Check that the job has a result from which the files can be written."""
     job = stored.job
     if job.outputs_of is not None:
         hint = f"It holds further files of job {job.outputs_of!r}: make them from that one."
-        raise NotAllowedNow(job.id, job.status, wanted="written in further files", hint=hint)
+        raise NotAllowedNow(job.id, job.status, wanted="exported to further files", hint=hint)
     if job.status is not Status.SUCCEEDED:
         hint = "It has no result." if job.status.final else "Wait until it has succeeded."
-        raise NotAllowedNow(job.id, job.status, wanted="written in further files", hint=hint)
+        raise NotAllowedNow(job.id, job.status, wanted="exported to further files", hint=hint)
     read = job.interpretation
     kinds_for(submission.options, size=(read.num_frames, read.num_points))
 
 
 def _inputs_of(stored: Stored) -> str:
-    """Return the blob of the tracks that were solved: of a film those that were tracked, not the film."""
+    """Return the blob of the solved tracks: for a film job, `tracks.npz` instead of the film."""
     with suppress(StopIteration):
         return next(f"{stored.prefix}{each.name}" for each in stored.job.artifacts if each.name == TRACKS)
     return stored.inputs

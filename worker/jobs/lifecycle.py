@@ -24,10 +24,10 @@ FINAL = (Status.SUCCEEDED, Status.FAILED, Status.CANCELLED)
 
 
 def again(job: Job, *, id: str, now: datetime, **changes: object) -> Job:
-    """Return a new queued job like a finished one, with other `changes`.
+    """Return a new queued job with the fields of a finished one, updated by `changes`.
 
-    Metrics, outcome, verdict and warnings stay. A failed or cancelled job has them only if it works from a stored result, and
-    then they are those of that result.
+    Metrics, outcome, verdict and warnings are kept: a failed or cancelled job has them only if it works from a stored result,
+    which they describe.
     """
     fresh: dict[str, object] = {
         "id": id, "status": Status.QUEUED, "created_at": now, "started_at": None, "finished_at": None, "expires_at": None,
@@ -37,7 +37,7 @@ def again(job: Job, *, id: str, now: datetime, **changes: object) -> Job:
 
 
 def claim(stored: Stored, *, attempt_id: str, worker: str, now: datetime) -> Stored:
-    """Start the job. The same claim again, after its reply was lost, changes nothing.
+    """Start the job. Repeating a claim whose reply was lost changes nothing.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A failed or cancelled job once more."""
+"""Retry of a failed or cancelled job."""
 
 from __future__ import annotations
 
@@ -38,7 +38,9 @@ def retry(jobs: Jobs, id: str, *, idempotency_key: str | None = None) -> Job:
     if known is not None:
         return known
     if job.status not in (Status.FAILED, Status.CANCELLED):
-        hint = "It has its result." if job.status is Status.SUCCEEDED else "Wait until it ends, or cancel it first."
+        hint = (
+            "It already has a result." if job.status is Status.SUCCEEDED else "Wait until it ends, or cancel it first."
+        )
         raise NotAllowedNow(id, job.status, wanted="run again", hint=hint)
     again = lifecycle.again(job, id=new_job_id(), now=jobs.clock(), retry_of=id)
     return jobs.create_copy(again, submission, stored, inputs=stored.inputs, result=stored.result)

@@ -1,4 +1,4 @@
-"""The operations on jobs: submit, get, list, cancel, retry, delete."""
+"""The operations on jobs: submit, get, list, cancel, delete; read artifacts, log and events."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ class Jobs:
     queue: Queue
     settings: Settings
     owner: str | None = None
-    """None: jobs of all owners; otherwise only those of this owner are visible."""
+    """Owner whose jobs are visible; None: jobs of all owners."""
     max_queued: int = 0
-    """Jobs of one owner that may be queued at once; 0: any number."""
+    """Maximum number of queued jobs per owner; 0: no limit."""
     max_running: int | None = None
-    """Jobs of one owner that may run at once; 0: any number; None: `Settings.max_running`."""
+    """Maximum number of running jobs per owner; 0: no limit; None: `Settings.max_running`."""
     clock: Callable[[], datetime] = utc_now
 
     @classmethod
     def open(cls, settings: Settings) -> Jobs:
-        """Return the jobs of the stores in the settings. Connections are made on first use, so Redis may still be starting."""
+        """Open the stores named by the settings. Connections are made on first use, so Redis may still be starting."""
         if settings.blob_url is None:
             with suppress(OSError):  # opening the store reports the error
                 make_data_directory(settings.data)
@@ -62,7 +62,7 @@ class Jobs:
         return replace(self, owner=owner)
 
     def submit(self, inputs_file: Path, submission: Submission, *, interpretation: Interpretation) -> Job:
-        """Accept a job. After this returns the job ends with a result or an error, whichever process is killed.
+        """Accept a job. Once this returns, the job will end with a result or an error, even if processes are killed.
 
         The canonical inputs, as `worker.formats.save_inputs` writes them, are linked or copied: the caller may unlink the file,
         but must not write to it.
@@ -76,7 +76,7 @@ class Jobs:
         QuotaExceeded
             Jobs and uploads have reached the disk quota.
         TooManyQueued
-            The owner's limit of queued jobs is reached.
+            The owner's limit on queued jobs is reached.
         """
         known = self.known(submission)
         if known is not None:
@@ -95,7 +95,7 @@ class Jobs:
         return self._create(job, submission, lambda key: self.blobs.put(key, inputs_file), size=size)
 
     def known(self, submission: Submission) -> Job | None:
-        """Return the job of an earlier identical request, None if the request is new. Raises as `submit`."""
+        """Return the job of an earlier identical request, None if the request is new. Raises the errors of `submit`."""
         if submission.id is not None:
             check_id(submission.id)
         if submission.idempotency_key is not None:
@@ -108,14 +108,14 @@ class Jobs:
         return None if found is None else self._same(found, submission)
 
     def check_capacity(self, *, id: str | None = None, idempotency_key: str | None = None) -> None:
-        """Check the limit of queued jobs before the inputs of a submission are received.
+        """Check the limit on queued jobs before the inputs of a submission are received.
 
         A repeated request passes, since it creates no job. The limit is checked again, atomically, when the record is written.
 
         Raises
         ------
         TooManyQueued
-            The owner's limit of queued jobs is reached.
+            The owner's limit on queued jobs is reached.
         """
         if not 0 < self.max_queued <= self.records.count([Status.QUEUED], owner=self.owner or ""):
             return
@@ -132,7 +132,7 @@ class Jobs:
         return self._placed(self.stored(id))
 
     def page(self, *, cursor: str | None = None, limit: int = 50, statuses: Sequence[Status] | None = None) -> JobPage:
-        """Return jobs, newest first, after the previous page's `JobPage.next`; of all statuses by default.
+        """Return a page of jobs, newest first. `cursor` is `next` of the previous page; `statuses` defaults to all.
 
         Raises
         ------
@@ -176,8 +176,8 @@ class Jobs:
     def delete(self, id: str) -> None:
         """Remove a finished job with its record and files. Files that cannot be removed now are removed by the reconciler.
 
-        A new job may have the id before the files are removed: only those are removed that the record names. What lost attempts left
-        is removed by the reconciler, too.
+        A new job may reuse the id at once, so only files named by the record are removed here. The reconciler also removes the
+        files of lost attempts.
 
         Raises
         ------
@@ -209,20 +209,20 @@ class Jobs:
         raise UnknownArtifact(id, name, names=[each.name for each in stored.job.artifacts])
 
     def kept_inputs(self, id: str, file: Path) -> tuple[Job, Path]:
-        """Return a job and its stored inputs under a local name, to submit them again. Do not write to the file.
+        """Copy or link a job's stored inputs to a local file, to submit them again; return job and file. Do not write to it.
 
         Raises
         ------
         NotAllowedNow
-            The job holds further files of another one, whose inputs are meant.
+            The job only writes further files of another one, whose inputs must be used instead.
         """
         stored = self.stored(id)
         if stored.job.outputs_of is not None:
-            hint = f"It holds further files of job {stored.job.outputs_of!r}: name that one."
+            hint = f"It holds further files of job {stored.job.outputs_of!r}: use that job."
             raise NotAllowedNow(id, stored.job.status, wanted="run with other options", hint=hint)
         try:
             self.blobs.fetch(stored.inputs, file)
-        except FileNotFoundError:  # deleted between our look and the copy
+        except FileNotFoundError:  # deleted between lookup and copy
             raise UnknownJob(id) from None
         return stored.job, file
 
@@ -259,7 +259,7 @@ class Jobs:
                 found[part] = "ok"
             except StoreUnavailable as error:
                 found[part] = str(error)
-        if found["redis"] != "ok":  # asking again would only take as long again
+        if found["redis"] != "ok":  # another query would wait just as long
             return {**found, "workers": found["redis"]}
         try:
             workers = self.queue.workers()
@@ -269,7 +269,7 @@ class Jobs:
         return found
 
     def stored(self, id: str) -> Stored:
-        """Return a job with what only the worker package needs of it."""
+        """Return a job with the internal fields of the worker package."""
         if not is_id(id):
             raise UnknownJob(id[:80])
         stored = self.records.get(id)
@@ -278,12 +278,12 @@ class Jobs:
         return stored
 
     def create_copy(self, job: Job, submission: Submission, source: Stored, *, inputs: str, result: str | None) -> Job:
-        """Store and queue a new job of the source's owner, with copies of stored inputs and of a result to work from.
+        """Store and queue a new job of the source's owner, with copies of the blobs `inputs` and, if given, `result`.
 
         Raises
         ------
         Conflict, QuotaExceeded, TooManyQueued
-            As `submit`.
+            See `submit`.
         UnknownJob
             The source was deleted meanwhile.
         """
@@ -309,8 +309,8 @@ class Jobs:
     ) -> Job:  # fmt: skip
         """Store a new job and queue it.
 
-        `put` stores `size` bytes: the inputs under a blob key, and with `from_result` the result to work from beside them. The
-        job belongs to the owner of these jobs unless another is given.
+        `put` stores `size` bytes: the inputs under the given blob key and, with `from_result`, the stored result beside them.
+        `owner` defaults to the owner of these jobs.
         """
         acceptance = Acceptance(records=self.records, blobs=self.blobs, queue=self.queue, settings=self.settings)
         acceptance.check_quota(size)

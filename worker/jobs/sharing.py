@@ -1,6 +1,6 @@
 """Share links: a secret that reads one job's results until it expires or is revoked.
 
-Only digests of the secrets are stored, in the job's own record: they go when the job goes.
+Only digests of the secrets are stored, in the job's record, so they are deleted with the job.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from pliant.worker.jobs.service import Jobs
 from pliant.worker.records import Records, Stored, StoredShare
 
 MOST_SHARES = 20
-"""Links of one job that are valid at once."""
+"""Maximum number of valid links per job."""
 
 LONGEST_TOKEN = 200
 
 
 def create_share(jobs: Jobs, id: str, request: ShareRequest) -> Share:
-    """Return a new link of a job, with its token.
+    """Create a share link for a job and return it with its token.
 
     Raises
     ------
     NotAllowedNow
         The job has no result.
     TooManyShares
-        The job has as many valid links as it may have.
+        The job has `MOST_SHARES` valid links.
     UnknownJob
         There is no such job.
     """
@@ -62,7 +62,7 @@ def list_shares(jobs: Jobs, id: str) -> list[Share]:
 
 
 def revoke_share(jobs: Jobs, id: str, share: str) -> None:
-    """End a link at once.
+    """Revoke a link, effective immediately.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def revoke_share(jobs: Jobs, id: str, share: str) -> None:
 
 
 def recognise_share(records: Records, token: str) -> tuple[Stored, StoredShare] | None:
-    """Return the job of a link's token and the link, which may have expired; None if there is no such link."""
+    """Return the job and the link, expired or not, of a link's token; None if there is no such link."""
     id, dot, secret = token.removeprefix(SHARE_PREFIX).rpartition(".")
     if len(token) > LONGEST_TOKEN or not token.startswith(SHARE_PREFIX) or not dot or not is_id(id):
         return None

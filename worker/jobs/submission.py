@@ -16,11 +16,11 @@ from pliant.worker.store.queue import Queue
 from pliant.worker.uploads.shared import open_uploads
 
 RANKS: dict[Priority, int] = {"high": 0, "normal": 1, "low": 2}
-"""Smaller comes first."""
+"""Queue rank of each priority; smaller ranks run first."""
 
 
 def order_waiting(records: Records, queue: Queue, owners: Collection[str]) -> None:
-    """Order the waiting jobs of each of these owners by priority, on the places that they hold: nobody else's job moves."""
+    """Sort each owner's waiting jobs by priority within their own queue positions, so that no other owner's job moves."""
     waiting = set(queue.waiting())
     beats = [each for each in records.beats(records.ids(Status.QUEUED)).values() if each.attempt_id in waiting]
     for owner in owners:
@@ -29,7 +29,7 @@ def order_waiting(records: Records, queue: Queue, owners: Collection[str]) -> No
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Submission:
-    """A client's request, besides the input files."""
+    """A client's request, without the input files."""
 
     options: Options
     """How to solve and which files to write."""
@@ -82,7 +82,7 @@ class Acceptance:
         Raises
         ------
         TooManyQueued, QuotaExceeded
-            Nothing is stored.
+            A limit is reached; nothing is stored.
         """
         put(stored.inputs)
         quota = self.settings.disk_quota
@@ -110,9 +110,9 @@ class Acceptance:
         return open_uploads(self.settings, self.blobs).used()
 
     def _over_running_limit(self, stored: Stored) -> bool:
-        """Whether the new job is held back until fewer jobs of its owner run; the reconciler queues it then.
+        """Return whether to hold the new job back until its owner has fewer running jobs; the reconciler then queues it.
 
-        Counted after the record is written, so that simultaneous submissions count each other.
+        Jobs are counted after the record is written, so that simultaneous submissions count each other.
         """
         most = self.settings.max_running if stored.max_running is None else stored.max_running
         unfinished = (Status.QUEUED, Status.RUNNING, Status.CANCELLING)

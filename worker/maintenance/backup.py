@@ -1,13 +1,12 @@
-"""Backup of a running installation into a directory, and its restoration into an empty one.
+"""Back up a running installation into a directory, and restore it into an empty installation.
 
-    manifest.json    when and by which version it was made, and the SHA-256 of the other two
-    jobs.jsonl       a job a line: record, log, undelivered webhook
-    rest.json        tokens (as SHA-256) and tallies
-    blobs/…          inputs and results, under the keys that they have in the blob store
+    manifest.json    time and version of the backup, SHA-256 of the next two files, sizes of the blobs
+    jobs-….jsonl     one job per line: record, log, undelivered webhook
+    rest-….json      tokens (as SHA-256) and counters
+    blobs/…          inputs and results, under their keys in the blob store
 
-A blob never changes under its key, and a record names all its blobs. So a record that is read first and its blobs that are copied
-afterwards fit together, whatever happens to other jobs meanwhile; a job that is deleted between the two is left out. Jobs that were
-running are queued again by the restoration.
+Blobs are immutable, and a record names all its blobs. A record that is read before its blobs are copied is therefore consistent with
+them, even while jobs run. A job that is deleted in between is omitted. Restoring requeues jobs that were running.
 """
 
 from __future__ import annotations
@@ -42,29 +41,29 @@ FORMAT = 1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Summary:
-    """What a backup holds."""
+    """Contents of a backup."""
 
     jobs: int
     blobs: int
     bytes: int
     copied: int
-    """Blobs that were not there yet."""
+    """Blobs that were copied; a backup reuses those already in its directory."""
 
 
 def write_backup(settings: Settings, target: Path) -> Summary:
-    """Write a backup while the installation runs. A directory that holds an earlier one is brought up to date.
+    """Back up an installation, which may be running. An earlier backup in the directory is updated.
 
-    The earlier backup stays whole until the new manifest replaces its own in one step.
+    The earlier backup stays valid until the new manifest atomically replaces the old one.
 
     Raises
     ------
     BadBackup
-        The directory holds something else.
+        The target is a file, or a directory that is neither empty nor a backup.
     StoreUnavailable
         A store does not answer.
     """
     if target.is_file() or (target.is_dir() and any(target.iterdir()) and not (target / "manifest.json").exists()):
-        raise BadBackup(f"{target} holds something that is no backup. Name an empty or a new directory.")
+        raise BadBackup(f"{target} is not a backup. Choose an empty or new directory.")
     target.mkdir(parents=True, exist_ok=True, mode=0o700)
     snapshot, jobs = Snapshot(settings), Jobs.open(settings)
     kept: dict[str, int] = {}
@@ -95,14 +94,14 @@ def write_backup(settings: Settings, target: Path) -> Summary:
 
 
 def restore_backup(settings: Settings, source: Path) -> Summary:
-    """Write a backup into an installation without jobs and tokens, whose service need not run.
+    """Restore a backup into an installation without jobs and tokens; its service need not run.
 
     Raises
     ------
     BadBackup
-        It is none, is damaged, or there are jobs already. A damaged one is noticed before anything is written.
+        There is no valid backup, or the installation has jobs or tokens. Damage is detected before anything is written.
     NewerData
-        A newer version wrote it.
+        The backup was written by a newer version.
     StoreUnavailable
         A store does not answer.
     """
@@ -111,7 +110,7 @@ def restore_backup(settings: Settings, source: Path) -> Summary:
     prepare(settings)
     snapshot, jobs = Snapshot(settings), Jobs.open(settings)
     if not snapshot.is_empty():
-        raise BadBackup("The installation has jobs or tokens already. Restore into an empty one.")
+        raise BadBackup("The installation already has jobs or tokens. Restore into an empty one.")
     kinds = _media_types(records)
     for key in manifest["blobs"]:
         jobs.blobs.put(key, source / "blobs" / key, media_type=kinds.get(key, "application/octet-stream"))
@@ -127,7 +126,7 @@ def restore_backup(settings: Settings, source: Path) -> Summary:
 
 
 def _copy_blobs(jobs: Jobs, stored: Stored, target: Path, kept: dict[str, int]) -> int | None:
-    """Copy the blobs of a record; return how many were not there, None if the job was deleted meanwhile."""
+    """Copy the missing blobs of a record; return their number, None if the job was deleted meanwhile."""
     sizes = {f"{stored.prefix}{each.name}": each.bytes for each in stored.job.artifacts}
     given = [key for key in (stored.inputs, stored.result) if key is not None]
     found: dict[str, int] = {}
@@ -184,7 +183,7 @@ def _manifest(source: Path) -> dict[str, Any]:
 
 
 def _verified(source: Path, manifest: dict[str, Any]) -> tuple[Path, Path]:
-    """Check the digests of the records and results and the size of every blob, before anything is restored."""
+    """Check the digests of records and results and the size of every blob; return the two files of records."""
     for name, digest in manifest["files"].items():
         if not (source / name).is_file() or _sha256(source / name) != digest:
             raise BadBackup(f"{source / name} is missing or was changed. Use another backup.")
@@ -200,7 +199,7 @@ def _verified(source: Path, manifest: dict[str, Any]) -> tuple[Path, Path]:
         for artifact in record["job"]["artifacts"]:
             file = source / "blobs" / f"{record['prefix']}{artifact['name']}"
             if _sha256(file) != artifact["sha256"]:
-                raise BadBackup(f"{file} was changed: its SHA-256 is not that of the record. Use another backup.")
+                raise BadBackup(f"{file} was changed: its SHA-256 does not match the record. Use another backup.")
     return records, rest
 
 
@@ -210,7 +209,7 @@ def _lines(records: Path) -> Iterator[str]:
 
 
 def _prune(target: Path, manifest: dict[str, Any]) -> None:
-    """Remove what belongs to an earlier backup alone."""
+    """Remove files that only an earlier backup uses."""
     _remove(target, lambda path: path.name.startswith(("jobs-", "rest-")) and path.name not in manifest["files"])
     blobs = target / "blobs"
     for path in sorted(blobs.rglob("*"), reverse=True):  # files before their folders

@@ -43,7 +43,7 @@ def _look(jobs: Jobs) -> Iterator[str]:
     yield from open_uploads(jobs.settings, jobs.blobs).findings(jobs.clock())
     used, counted = jobs.records.used(), sum(stored.bytes for stored in records)
     if used != counted:
-        yield f"The jobs hold {counted:,} bytes, but {used:,} are counted."
+        yield f"The jobs use {counted:,} bytes, but the counter is at {used:,}."
 
 
 def _all(jobs: Jobs) -> Iterator[Stored]:
@@ -67,7 +67,7 @@ def _of_record(stored: Stored, sizes: dict[str, int]) -> Iterator[str]:
         if held != artifact.bytes:
             yield f"Job {job.id}: {artifact.name} should have {artifact.bytes:,} bytes and has {held}."
     if job.status.final is not (job.finished_at is not None):
-        yield f"Job {job.id} is {job.status.value} and its time of finishing is {job.finished_at}."
+        yield f"Job {job.id} is {job.status.value} but finished_at is {job.finished_at}."
     if (job.status is Status.FAILED) is not (job.error is not None):
         yield f"Job {job.id} is {job.status.value} and its error is {job.error}."
     if (job.status is Status.SUCCEEDED) is not (stored.prefix is not None):

@@ -45,12 +45,12 @@ return within this time and still store files until its next heartbeat fails."""
 
 @dataclass(slots=True)
 class Stillness:
-    """Time for which each value has not changed, by the monotonic clock."""
+    """Tracks how long each value has not changed, by the monotonic clock."""
 
     _seen: dict[str, tuple[object, float]] = field(default_factory=dict)
 
     def look(self, things: dict[str, object], gap: float) -> dict[str, float]:
-        """Observe the values `gap` seconds after the previous time; return for each the seconds without a change."""
+        """Observe the values `gap` seconds after the previous call; return the seconds without a change for each."""
         still: dict[str, tuple[object, float]] = {}
         for name, value in things.items():
             before, seconds = self._seen.get(name, (None, 0.0))
@@ -79,12 +79,12 @@ class Reconciler:
         self.retention = Retention(jobs=self.jobs)
 
     def tick(self) -> None:
-        """Do what is due.
+        """Run the tasks that are due.
 
         Raises
         ------
         StoreUnavailable
-            The store does not answer; nothing is lost, the work stays due.
+            The store does not answer; nothing is lost, and the tasks stay due.
         """
         now = self.clock()
         gap = 0.0 if self._looked is None else min(now - self._looked, 2 * LOOK_EVERY)
@@ -96,7 +96,7 @@ class Reconciler:
             self._ended = None  # expired and finished jobs may cancel out in the count
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Tick until `stop` is set; wait while the store is unavailable."""
+        """Call `tick` every `LOOK_EVERY` seconds until `should_stop` returns True; an unavailable store is only logged."""
         while not should_stop():
             try:
                 self.tick()
@@ -134,8 +134,8 @@ class Reconciler:
     def _queue_forgotten(self, gap: float) -> None:
         """Queue the jobs that are missing from the queue, and those held back whose owner has capacity again.
 
-        The marks in the queue distinguish the two. The previous check cannot, since a job may be held back and its owner
-        regain capacity between two checks.
+        Marks in the queue distinguish the two. A comparison with the previous check could not, since a job may be held back and
+        its owner regain capacity between two checks.
         """
         records, queue = self.jobs.records, self.jobs.queue
         noted = queue.held()  # read first: a mark is written after its record, so one without a record is stale

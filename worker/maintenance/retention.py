@@ -23,10 +23,10 @@ SWEEP_EVERY = 3600.0
 """Seconds between two checks for files that belong to no job."""
 
 ORPHAN_AGE = timedelta(hours=6)
-"""Age in seconds above which a file of an unknown job is removed; a younger one may belong to a submission without a record yet."""
+"""Age above which a file of an unknown job is removed; a younger one may belong to a submission without a record yet."""
 
 DEAD_AGE = timedelta(minutes=1)
-"""Age in seconds above which scratch directories of ended attempts are removed; their worker may still read younger ones."""
+"""Age above which scratch directories of ended attempts are removed; their worker may still read younger ones."""
 
 JUMP = 60.0
 """Seconds by which wall clock and monotonic clock must diverge between two checks to count as a jump."""
@@ -47,12 +47,12 @@ class Retention:
     _swept: float | None = None
 
     def tick(self, now: float) -> bool:
-        """Do what is due at monotonic time `now`; return True if it tidied.
+        """Run the tasks that are due at monotonic time `now`; return True if expired jobs and uploads were checked.
 
         Raises
         ------
         StoreUnavailable
-            A store does not answer; nothing is lost, the work stays due.
+            A store does not answer; nothing is lost, and the tasks stay due.
         """
         self._check_clock(now)
         tidied = self._tidied is None or now >= self._tidied + TIDY_EVERY

@@ -1,9 +1,9 @@
 """Run a module of this package in a separate process with resource limits, and return its answer or its rejection.
 
 Three processes are started this way: the isolated reader, which reads large inputs; the sandbox, which runs untrusted parsers;
-and the film process, which decodes and tracks films. Each receives a JSON request on standard input and writes a JSON answer to
-standard output, a temporary file, of which the parent reads at most `MAX_ANSWER` bytes. It ends with its parent. Long-running
-processes may send progress over a pipe, one JSON object per line.
+and the film process, which decodes and tracks films. Each receives a JSON request on standard input, writes a JSON answer to standard
+output, and ends with its parent. Standard output is a temporary file, of which the parent reads at most `MAX_ANSWER` bytes.
+Long-running processes may send progress over a pipe, one JSON object per line.
 """
 
 from __future__ import annotations
@@ -68,11 +68,11 @@ def run_contained(
     on_line: Callable[[dict[str, Any]], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Ended:
-    """Start `python -I -m module`, whose `main` calls `serve`, and return how it ended. It inherits only what is passed.
+    """Run `python -I -m module`, whose `main` calls `serve`, and return how it ended. It inherits only what is passed here.
 
     It is killed after `seconds` of wall time, or once `should_stop`, called every `POLL` seconds, returns True. Its environment
-    has `environment` and the variables that limit the numerical libraries to one thread. `on_line` is called with every JSON
-    object that it writes to the descriptor `progress` of its request.
+    consists of `environment` and the variables that limit the numerical libraries to one thread. `on_line` is called with every
+    JSON object that it writes to the descriptor `progress` of its request.
     """
     with _Progress(on_line) as progress:
         stated = dict(request) if progress.target is None else {**request, "progress": progress.target}
@@ -142,7 +142,7 @@ class _Progress:
                 os.close(descriptor)
 
     def wait(self, process: subprocess.Popen[bytes], until: float) -> None:
-        """Return when the process has ended, at a time of the monotonic clock, or after the next progress."""
+        """Wait until progress arrives or the process ends, at most until the monotonic time `until`."""
         seconds = max(0.0, until - time.monotonic())
         if self._source is None:
             with suppress(subprocess.TimeoutExpired):
@@ -151,7 +151,7 @@ class _Progress:
             self.read()
 
     def read(self) -> None:
-        """Pass on the lines that have arrived, at most one pipe buffer."""
+        """Deliver the lines that have arrived, at most one pipe buffer."""
         if self._source is None or self._on_line is None:
             return
         try:
@@ -191,7 +191,7 @@ def serve(handle: Callable[[dict[str, Any]], str]) -> int:
 
 def limit_process(limits: Mapping[int, int]) -> None:
     """Set resource limits for the rest of the process's life; limits that the system lacks are skipped."""
-    import resource  # here, because Windows does not have it: `pliant solve` reads npz files there
+    import resource  # imported here because Windows lacks it, where `pliant solve` reads npz files
 
     for name, bound in limits.items():
         with suppress(ValueError, OSError):  # macOS has no limit on the address space

@@ -14,9 +14,9 @@ _libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
 
 def die_with_parent(parent: int, *, how: signal.Signals = signal.SIGKILL) -> None:
-    """Make the kernel signal this process when its parent ends (Linux; elsewhere the parent's id is polled).
+    """Make the kernel signal this process when its parent ends (Linux; elsewhere a job process polls its parent's id).
 
-    The id of the parent is taken before the fork, since it may have ended.
+    `parent` is the parent's process id, taken before the fork, because the parent may already have ended.
     """
     if _libc is not None:
         _libc.prctl(_PR_SET_PDEATHSIG, int(how), 0, 0, 0)
@@ -26,7 +26,7 @@ def die_with_parent(parent: int, *, how: signal.Signals = signal.SIGKILL) -> Non
 
 @dataclass(frozen=True, slots=True)
 class OomKills:
-    """Counts of out-of-memory kills: in the own control group, and on the whole machine."""
+    """Counts of out-of-memory kills, in this process's control group and on the machine."""
 
     group: int
     machine: int
@@ -37,7 +37,7 @@ class OomKills:
         return cls(_counter(_group_events(), "oom_kill"), _counter(Path("/proc/vmstat"), "oom_kill"))
 
     def since(self, before: OomKills) -> bool:
-        """Whether there was a kill between two readings."""
+        """Return whether the kernel killed a process since an earlier reading."""
         return self.group > before.group or self.machine > before.machine
 
 

@@ -1,4 +1,4 @@
-"""How much memory a job may take on this machine."""
+"""Memory available to one job on this machine."""
 
 from __future__ import annotations
 
@@ -8,18 +8,15 @@ from pathlib import Path
 from pliant.worker.settings import Settings
 
 LIBRARIES = 400 << 20
-"""Bytes of address space that libraries take without being resident: the difference between what `PLIANT_MEMORY_LIMIT` bounds and the
-memory that a job needs."""
+"""Bytes of address space that libraries reserve without being resident: the difference between the address space, which
+`PLIANT_MEMORY_LIMIT` bounds, and the memory that a job needs."""
 
 GROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
-"""Where a container's memory limit stands: bytes, or `max` (cgroup v2)."""
+"""File with a container's memory limit: bytes, or `max` (cgroup v2)."""
 
 
 def memory_for_a_job(settings: Settings, *, group: Path = GROUP_LIMIT) -> int:
-    """Return the bytes that one job may take: its limit, and no more than its share of the container's or machine's memory.
-
-    Returns 0 where nothing is known.
-    """
+    """Return the bytes for one job: the lower of its limit and its share of the container's or machine's memory; 0 if unknown."""
     there = [size for size in (_physical(), _group(group)) if size > 0]
     share = min(there) // settings.workers if there else 0
     limit = max(0, settings.memory_limit - LIBRARIES)

@@ -17,7 +17,7 @@ _LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06
 """Instructions of the filter: load a word of `seccomp_data`, compare it, return."""
 
 _X32 = 0x40000000
-"""System calls of the x32 ABI on x86-64 have numbers from here on."""
+"""Lowest number of a system call of the x32 ABI on x86-64."""
 
 DENIED = {
     # socket, execve, ptrace, process_vm_readv, process_vm_writev, execveat, io_uring_setup
@@ -25,7 +25,7 @@ DENIED = {
     # socket, execve, ptrace, process_vm_readv, process_vm_writev, execveat, io_uring_setup
     "aarch64": (0xC00000B7, (198, 221, 117, 270, 271, 281, 425)),
 }
-"""For each machine, its audit number and the system calls that fail with EACCES."""
+"""Audit number of each architecture, and the system calls that fail with EACCES."""
 
 
 class _Instruction(ctypes.Structure):

@@ -1,6 +1,6 @@
 """The supervisor: start processes, restart those that end, stop them all on SIGTERM or Ctrl-C.
 
-It only handles commands and talks to neither Redis nor HTTP, so an unavailable service cannot block it.
+It only manages processes and uses neither Redis nor HTTP, so an unavailable service cannot block it.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class Supervisor:
                 logger.warning("%s ended with code %s; starting it again in %.1f s", each.child.name, code, each.pause)
 
     def stop(self) -> None:
-        """Stop the children, those that others depend on last; kill each at the end of its grace period."""
+        """Stop the children, foundations last; kill each one that outlives its grace period."""
         for foundation in (False, True):
             group = [each for each in self._running if each.child.foundation is foundation and each.process is not None]
             for each in reversed(group):

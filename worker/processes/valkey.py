@@ -54,7 +54,7 @@ def find_binary() -> Path:
         if found is not None:
             return Path(found)
     raise ServerFailed(
-        "No Valkey server for this machine was found. Install valkey-server or redis-server, or give PLIANT_REDIS_URL.",
+        "No Valkey server for this machine was found. Install valkey-server or redis-server, or set PLIANT_REDIS_URL.",
         log="",
     )
 
@@ -78,7 +78,7 @@ class Valkey:
         Raises
         ------
         DataDirectoryInUse
-            Another supervisor runs on it, or its server does not stop.
+            Another supervisor uses the directory, or its server does not stop.
         ServerFailed
             There is no server binary, or the socket's directory belongs to another user.
         """
@@ -109,7 +109,7 @@ class Valkey:
         Raises
         ------
         ServerFailed
-            It exited, or does not answer in time.
+            The server exited, or did not answer in time.
         """
         deadline = time.monotonic() + STARTS_WITHIN
         while time.monotonic() < deadline:
@@ -164,7 +164,7 @@ def attended(settings: Settings) -> Iterator[None]:
 
 
 def _answers(path: Path) -> bool:
-    """Whether a server answers on a socket, and has read its file; asked without the client library, which `pliant up` does not need."""
+    """Return whether a server on the socket has loaded its data; works without the client library, which `pliant up` does not import."""
     with socket.socket(socket.AF_UNIX) as probe:
         probe.settimeout(PONG_WITHIN)
         try:

@@ -28,7 +28,7 @@ BLOCK = 4 << 20
 """Bytes per request to a remote store, so that each request can have a time limit."""
 
 ANSWER_WITHIN = 8.0
-"""Seconds a remote store has to answer one call."""
+"""Time limit of one call to a remote store, seconds."""
 
 SLOWEST = 1 << 20
 """Bytes per second below which a transfer to a remote store counts as stalled."""
@@ -43,7 +43,7 @@ RETRIES: Any = {
 
 SWITCHES = ("allow_http", "allow_invalid_certificates", "http1_only", "http2_only")
 TEXTS = ("proxy_url", "proxy_ca_certificate", "proxy_excludes", "user_agent")
-"""Options of the connection to S3 that `AWS_` variables of the same names set."""
+"""Connection options for S3, set by the `AWS_…` variables of the same names."""
 
 Answer = TypeVar("Answer")
 
@@ -58,12 +58,12 @@ class Blob:
     """Bytes."""
 
     def link(self, *, seconds: float) -> str | None:
-        """Return a URL from which anybody can read the file for some seconds, None if the store has no such URLs.
+        """Return a URL from which anyone can read the file for `seconds`, None if the store has no such URLs.
 
         Raises
         ------
         StoreUnavailable
-            The credentials to sign it with cannot be read.
+            The credentials for signing cannot be read.
         """
         return self._blobs.link(self.key, seconds=seconds)
 
@@ -125,8 +125,8 @@ class Blobs:
     def put(self, key: str, file: Path, *, media_type: str = "application/octet-stream") -> int:
         """Store a file atomically; return its size in bytes.
 
-        A local store links the file if possible instead of copying it: do not write to it afterwards. S3 keeps the media type,
-        and the last part of the key as the file's name, for those who follow a `Blob.link`.
+        A local store links the file if possible instead of copying it: do not write to it afterwards. A remote store also keeps
+        the media type, and the last part of the key as the file name, for downloads through `Blob.link`.
         """
         size = file.stat().st_size
         local = self._local(key)
@@ -144,11 +144,11 @@ class Blobs:
 
     @property
     def remote(self) -> bool:
-        """True for an object store that other hosts can reach, too."""
+        """Whether this is an object store, which other hosts can reach, too."""
         return self._calls is not None
 
     def link(self, key: str, *, seconds: float) -> str | None:
-        """Return a URL from which anybody can read a file for some seconds, None if the store is not S3. Raises as `Blob.link`."""
+        """Return a URL from which anyone can read a file for `seconds`, None if the store is not S3; see `Blob.link`."""
         store = self._store
         if not isinstance(store, S3Store):
             return None
@@ -175,7 +175,7 @@ class Blobs:
         return self._call(lambda: bytes(obstore.get_range(self._store, key, start=start, end=end)))
 
     def fetch(self, key: str, file: Path) -> None:
-        """Make a stored file available under a local name, as a link if the store is local. Do not write to it."""
+        """Copy a stored file to a local path, or link it if the store is local. Do not write to it."""
         local = self._local(key)
         if local is not None and _linked(local, file):
             return
@@ -233,10 +233,10 @@ class Blobs:
 
 
 def client_options(environment: Mapping[str, str]) -> dict[str, object]:
-    """Return the `AWS_` variables about the connection: obstore does not read them itself beside options that it is given.
+    """Return the connection options set by `AWS_…` variables, which obstore ignores if it is given other options.
 
-    Those about credentials, region and endpoint are read by obstore. `AWS_TIMEOUT` and `AWS_CONNECT_TIMEOUT` have no effect,
-    because the time limits here depend on each other.
+    obstore itself reads those for credentials, region and endpoint. `AWS_TIMEOUT` and `AWS_CONNECT_TIMEOUT` have no effect, because
+    the time limits here depend on each other.
     """
     given: dict[str, object] = {}
     for name in SWITCHES:

@@ -1,4 +1,4 @@
-"""Limits for calls to stores that may hang, so that requests which need nothing of them are served."""
+"""Limits on calls to stores that may hang, so that requests that do not need the store are still served."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ import redis
 from pliant.worker.errors import StoreUnavailable
 
 AT_ONCE = 12
-"""Maximum number of concurrent calls of the blob store."""
+"""Maximum number of concurrent calls to the blob store."""
 
 WAITING = 12
-"""Maximum number of waiting calls. With the concurrent ones they are fewer than the 40 request threads of the service, so that
-requests that need no blob store are served while the store hangs."""
+"""Maximum number of waiting calls. Together with `AT_ONCE` it is below the 40 request threads of the service, so that requests that
+do not need the blob store are served while it hangs."""
 
 Answer = TypeVar("Answer")
 
@@ -34,7 +34,7 @@ class RemoteCalls:
     def run(self, call: Callable[[], Answer], *, seconds: float) -> Answer:
         """Return the result of the call; its exceptions pass through.
 
-        The limit in seconds includes the wait for a thread. The call itself may end later, by its own time limit.
+        `seconds` includes the wait for a thread. The call itself may end later, at its own time limit.
 
         Raises
         ------
@@ -62,25 +62,25 @@ COMMANDS = 24
 """Maximum number of commands that wait for Redis at once, fewer than the 40 request threads of the service."""
 
 TURN = 2.0
-"""Seconds that a command waits until fewer do."""
+"""Maximum seconds that a command waits while `COMMANDS` others wait for the server."""
 
 SILENT_AFTER = 2.0
-"""Seconds without an answer, although a command waits for one, after which the server counts as silent."""
+"""Seconds without any answer, while a command is waiting for one, after which the server counts as silent."""
 
 PROBES = 4
-"""Commands that wait for a silent server; others are refused at once, except one each second."""
+"""Maximum number of commands that wait for a silent server; further ones are rejected, except for one per second."""
 
 
 LAST_LOOK = 0.05
-"""Seconds that a command waits for a sign of a silent server before it is refused: after a pause of this process itself, such as on
-an overloaded machine, the answers are there and have only to be read."""
+"""Seconds that a command waits for an answer of a silent server before it is rejected. If this process itself was paused, as on an
+overloaded machine, the answers have already arrived and only need to be read."""
 
 
 @dataclass(slots=True)
 class SilentServer:
-    """Counts the commands that wait for one Redis server, and refuses further ones while it does not answer.
+    """Counts the commands that wait for one Redis server, and rejects further ones while it does not answer.
 
-    Without it each request would wait for the full time limit, and those without a thread even longer.
+    Otherwise each request would wait for the full time limit, and requests that wait for a thread even longer.
     """
 
     clock: Callable[[], float] = time.monotonic
@@ -89,17 +89,17 @@ class SilentServer:
     """When each waiting command was sent."""
     _answered: float = 0.0
     _silent: bool = False
-    """The last command that ended waited too long, in vain."""
+    """Whether a command failed after more than `SILENT_AFTER` seconds, and none was answered since."""
     _probed: float = 0.0
 
     @contextmanager
     def call(self) -> Iterator[None]:
-        """Send a command in this block.
+        """Count the command that is sent in this block.
 
         Raises
         ------
         redis.TimeoutError
-            It was not sent: the server is silent, or too many commands are waiting.
+            The command was not sent: the server is silent, or too many commands are waiting.
         """
         command = object()
         with self._room:

@@ -34,7 +34,7 @@ class RedisChanges(Changes):
             until = time.monotonic() + timeout
             while not found and (left := until - time.monotonic()) > 0:
                 message = self._pubsub.get_message(timeout=left)
-                while message is not None:  # and all other messages that have arrived
+                while message is not None:  # drain all messages that have arrived
                     found.add(_text(message["data"]))
                     message = self._pubsub.get_message(timeout=0)
         return found

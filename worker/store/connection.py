@@ -17,18 +17,18 @@ CONNECT_WITHIN = 3.0
 """Seconds to open a connection."""
 
 ANSWER_WITHIN = 7.0
-"""Seconds a command may take. Together with `CONNECT_WITHIN` the time after which a request ends with 503 while Redis hangs: 10 s."""
+"""Maximum seconds of a command. While Redis hangs, a request ends with 503 after this and `CONNECT_WITHIN`, 10 s in total."""
 
 BLOCK_WITHIN = 30.0
-"""The same for blocking commands: a worker that waits for a delivery."""
+"""The same for blocking commands, with which workers wait for deliveries."""
 
 
 _SILENCE: dict[str, SilentServer] = {}
-"""Of each server that this process has a client for."""
+"""State of each server that this process has a client for, by URL."""
 
 
 class _Client(redis.Redis):
-    """Sends commands and pipelines only while the server answers. Subscriptions are not counted: they wait for long."""
+    """Sends commands and pipelines only while the server answers. Subscriptions are not counted, because they wait for a long time."""
 
     server: SilentServer
 
@@ -51,11 +51,11 @@ class _Pipeline(Pipeline):
 
 
 def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | None = None) -> redis.Redis:
-    """Return a client that connects on first use; `decode` gives text instead of bytes, which RQ needs.
+    """Return a client that connects on first use. Its replies are text if `decode` is True, else bytes, which RQ needs.
 
     After a broken connection it retries with growing pauses of up to 0.5 s. All writes are compare-and-set or idempotent, so a
-    retry after a lost reply is harmless. Timeouts are not retried: that would multiply the wait. A command may take
-    `answer_within` seconds; by default `ANSWER_WITHIN`, and then few commands wait at once while the server is silent.
+    retry after a lost reply is harmless. Timeouts are not retried, since that would multiply the wait. `answer_within` is the time
+    limit of a command, seconds; None: `ANSWER_WITHIN`, and `SilentServer` limits the commands sent to a silent server.
     """
     seconds = ANSWER_WITHIN if answer_within is None else answer_within
     client = (redis.Redis if answer_within is not None else _Client).from_url(
@@ -72,12 +72,12 @@ def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | 
 
 
 def check_server(url: str) -> str:
-    """Send a command that needs the password of the URL; return the server's policy for full memory, empty if it is not readable.
+    """Check access with the password in the URL; return the server's `maxmemory-policy`, empty if it is not readable.
 
     Raises
     ------
     StoreUnavailable
-        The server does not answer, or refuses the password.
+        The server does not answer or rejects the password, or the URL is malformed.
     """
     try:
         client = connect(url, decode=True, retries=0, answer_within=3.0)
@@ -91,7 +91,7 @@ def check_server(url: str) -> str:
             except redis.ResponseError:  # managed servers hide their configuration
                 return ""
             return found.get("maxmemory-policy", "")
-    except redis.ResponseError as error:  # no password was sent where one is needed, or its user may not do this
+    except redis.ResponseError as error:  # a required password is missing, or the user lacks permission
         raise StoreUnavailable("The job store", reason=str(error)[:200]) from error
     finally:
         client.close()

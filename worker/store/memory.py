@@ -238,7 +238,7 @@ class MemoryQueue(Queue):
 
 
 class MemoryHash:
-    """The commands of Redis on hashes that `pliant.worker.tokens.Tokens` uses."""
+    """The Redis hash commands that `pliant.worker.tokens.Tokens` uses."""
 
     def __init__(self) -> None:
         self._hashes: dict[str, dict[str, str]] = {}

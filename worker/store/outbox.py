@@ -1,4 +1,4 @@
-"""The outbox: finished jobs whose webhook is still to be sent. An entry is written atomically with the job's final status.
+"""The outbox: finished jobs with a pending webhook. An entry is written atomically with the job's final status.
 
 Webhooks are therefore delivered at least once, whichever process is killed; receivers recognise duplicates by `webhook-id`.
 """
@@ -48,7 +48,7 @@ class Outbox:
         self._close = client.register_script(_CLOSE)
 
     def take(self, *, now: int, until: int) -> tuple[str, int] | None:
-        """Lease the message that has been due longest until the time `until`.
+        """Lease the message that has been due longest, until the time `until`; return None if none is due.
 
         Returns
         -------
@@ -75,7 +75,7 @@ class Outbox:
             self._redis.zadd(f"{self._at}outbox", {id: due}, xx=True)
 
     def postpone(self, id: str, *, due: int) -> None:
-        """Return a message that was leased but not tried."""
+        """Return a leased message that was not sent; the lease does not count as an attempt."""
         with reachable():
             self._postpone(args=[self._at, id, due])
 

@@ -33,7 +33,7 @@ for i, each in ipairs(found) do redis.call('LSET', KEYS[1], places[i], each[1]) 
 """
 
 FAILURE_KEPT = 60
-"""Seconds RQ keeps its entry of a failed delivery; the authority is the job record."""
+"""Seconds for which RQ keeps its entry of a failed delivery; the job record is authoritative."""
 
 
 def alive_key(queue: str, worker: str) -> str:
@@ -74,7 +74,7 @@ class Queue(ABC):
 
     @abstractmethod
     def order(self, ranks: Mapping[str, int]) -> None:
-        """Order these attempts by rank, smaller first and else as they are, on the places that they hold together."""
+        """Sort these attempts by rank, ascending and stable, within the queue positions that they occupy."""
 
     @abstractmethod
     def tidy(self) -> None:
@@ -86,7 +86,7 @@ class Queue(ABC):
 
     @abstractmethod
     def memories(self) -> dict[str, int]:
-        """Return the bytes that a job may take on each of these workers, by name; those that state none are left out."""
+        """Return the bytes available to a job on each of these workers, by name; workers that report none are omitted."""
 
 
 class RedisQueue(Queue):
@@ -123,7 +123,7 @@ class RedisQueue(Queue):
                 RqJob.fetch(attempt_id, connection=self._redis, serializer=JSONSerializer).delete()
             except (NoSuchJobError, InvalidJobOperation):  # removed already
                 return
-            except ValueError:  # the worker that took it is just removing its own entry, which RQ reports as an error
+            except ValueError:  # the worker is removing the entry at the same time, which RQ reports as an error
                 self._redis.delete(RqJob.key_for(attempt_id))
 
     def hold(self, attempt_id: str) -> None:

@@ -11,7 +11,7 @@ Keys, all under one prefix::
     deleted               sorted set of deleted jobs whose files are still to be removed, by time of deletion
     changes               channel on which the id of every changed job is published
     tally                 hash: counters since the installation was created
-    outbox, outbox:tries  jobs with a pending webhook and when it is due; number of attempts (`worker.outbox`)
+    outbox, outbox:tries  jobs with a pending webhook and when it is due; number of attempts (`store.outbox`)
 
 Each write is one Lua script and therefore atomic, also in the append-only file.
 """
@@ -43,8 +43,8 @@ from pliant.worker.store.changes import RedisChanges
 from pliant.worker.store.connection import reachable
 
 # ARGV: 1 prefix, 2 id, 3 version, 4 status, 5 attempt id, 6 owner, 7 sort key, 8 bytes, 9 key digest, 10 body, 11 event, 12 data, 13 cap,
-# 14 most queued jobs of the owner (0: any), 15 most running ones as its owner's token states ('': nothing),
-# 16 bytes that all jobs may hold (0: any), 17 priority
+# 14 maximum queued jobs of the owner (0: no limit), 15 maximum running ones by the owner's token ('': not set),
+# 16 maximum bytes of all jobs (0: no limit), 17 priority
 _CREATE = """
 local at = ARGV[1]
 if ARGV[9] ~= '' then
@@ -72,7 +72,7 @@ _FULL, _NO_SPACE = "!full", "!space"
 """Results of `_CREATE` when the owner's queue or the quota is full; ids never start with this character."""
 
 # ARGV: 1 prefix, 2 id, 3 version before, 4 version, 5 status, 6 attempt id, 7 bytes, 8 body, 9 event, 10 data, 11 cap,
-# 12 when the webhook is due ('': none), 13 … tallies and what to add to them
+# 12 when the webhook is due ('': none), 13 … counters and their increments
 _REPLACE = """
 local at, job = ARGV[1], ARGV[1] .. 'job:' .. ARGV[2]
 local held = redis.call('HMGET', job, 'version', 'status', 'owner', 'sort', 'bytes')

@@ -1,7 +1,7 @@
-"""The version of what is stored, and the steps that bring older data up to it.
+"""Version of the stored records, and migrations from older versions.
 
-Every process that writes compares the version when it starts. Older data is migrated once; data of a newer version is refused,
-because an older program could drop what it does not know.
+Every process that writes checks the version when it starts. Older data is migrated once; newer data is rejected, because an older
+program could drop fields that it does not know.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ CURRENT = 2
 """
 
 _LOCK_SECONDS = 60
-"""Longest time that one process may migrate while the others wait."""
+"""Maximum seconds for which one process may migrate while the others wait."""
 
-# ARGV: 1 prefix, 2 id, 3 body before, 4 body. Changes only what nobody else has changed meanwhile.
+# ARGV: 1 prefix, 2 id, 3 body before, 4 body. Does nothing if the body has changed meanwhile.
 _REWRITE = """
 local job = ARGV[1] .. 'job:' .. ARGV[2]
 if redis.call('HGET', job, 'body') ~= ARGV[3] then return 0 end
@@ -42,7 +42,7 @@ def _name_the_schema(body: dict[str, Any]) -> dict[str, Any]:
 
 
 STEPS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {1: _name_the_schema}
-"""What brings the JSON of a record from each version to the next one."""
+"""Migration of a record's JSON from each version to the next one."""
 
 
 def migrated(body: dict[str, Any]) -> dict[str, Any]:
@@ -51,7 +51,7 @@ def migrated(body: dict[str, Any]) -> dict[str, Any]:
     Raises
     ------
     NewerData
-        A newer version wrote it.
+        The record was written by a newer version.
     """
     version = int(body.get("schema", 1))
     if version > CURRENT:
@@ -62,12 +62,12 @@ def migrated(body: dict[str, Any]) -> dict[str, Any]:
 
 
 def prepare(settings: Settings) -> int:
-    """Bring an installation's records up to the current version; return how many were rewritten.
+    """Migrate an installation's records to the current version; return how many were rewritten.
 
     Raises
     ------
     NewerData
-        A newer version wrote them.
+        The records were written by a newer version.
     StoreUnavailable
         The store does not answer.
     """

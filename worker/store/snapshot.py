@@ -1,4 +1,4 @@
-"""Records as text that leaves the store, for backups: each job in one atomic look, tokens and tallies beside them."""
+"""Export and import of stored records, for backups: each job is read atomically, tokens and counters separately."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pliant.worker.store.connection import connect, reachable
 from pliant.worker.store.redis import RedisRecords
 from pliant.worker.store.schema import migrated
 
-# ARGV: 1 prefix, 2 id. One look: record, log and what its webhook owes belong together.
+# ARGV: 1 prefix, 2 id. Record, log and pending webhook are read atomically.
 _READ = """
 local at = ARGV[1]
 local body = redis.call('HGET', at .. 'job:' .. ARGV[2], 'body')
@@ -42,7 +42,7 @@ class Snapshot:
                     yield found
 
     def job(self, id: str) -> dict[str, Any] | None:
-        """Return one job as it is now, None if there is none."""
+        """Return one job, None if it does not exist."""
         with reachable():
             found = self._read(args=[self._at, id])
         if found is None:
@@ -51,7 +51,7 @@ class Snapshot:
         return {"record": json.loads(body), "log": log, "due": due, "tries": tries}
 
     def rest(self) -> dict[str, dict[str, str]]:
-        """Return what belongs to no job: tokens, and what was counted since the installation began."""
+        """Return the data that belongs to no job: tokens, and the counters since the installation was created."""
         with reachable():
             return {name: self._redis.hgetall(f"{self._at}{name}") for name in ("tokens", "tally")}
 
@@ -60,7 +60,7 @@ class Snapshot:
         return self._records.count(list(Status)) == 0 and not self.rest()["tokens"]
 
     def write(self, job: dict[str, Any]) -> Stored:
-        """Write a job of a snapshot, of this version or an older one, that is not there yet."""
+        """Write a job of a snapshot, migrated if it is older; the store must not contain its id."""
         stored = self._records.create(Stored.model_validate(migrated(job["record"])))
         self._records.append_log(stored.job.id, job["log"])
         if job["due"] is not None:
@@ -70,7 +70,7 @@ class Snapshot:
         return stored
 
     def write_rest(self, rest: dict[str, dict[str, str]]) -> None:
-        """Write tokens and tallies."""
+        """Write tokens and counters."""
         with reachable():
             for name in ("tokens", "tally"):
                 if rest.get(name):

@@ -17,7 +17,7 @@ from pathlib import Path
 from pliant.worker.errors import Conflict, UnknownUpload
 
 PART, WHOLE, LENGTH, RESERVED = "part", "whole-", "length", "reserved"
-"""File that exists while the upload is written: its reserved bytes, locked by the writer."""
+"""Files of an upload. `RESERVED` exists while the upload is written: it holds the number of reserved bytes, locked by the writer."""
 
 
 @contextmanager
@@ -27,7 +27,7 @@ def locked(folder: Path, *, make: bool, id: str) -> Iterator[None]:
     Raises
     ------
     UnknownUpload
-        There is none, and `make` is False.
+        The folder does not exist, and `make` is False.
     Conflict
         Another process holds the lock.
     """
@@ -63,7 +63,7 @@ def _lock(folder: Path, *, make: bool, id: str) -> int:
 
 
 def content(folder: Path) -> Path | None:
-    """Return the file of an upload's bytes, None if there is none."""
+    """Return the file with an upload's bytes, None if there is none."""
     for _ in range(2):  # it may have been completed between the two checks
         for path in folder.glob(f"{WHOLE}*"):
             return path
@@ -80,7 +80,7 @@ def reserve(folder: Path) -> int:
 
 
 def taken(folder: Path) -> int:
-    """Return the bytes that an upload takes of the quota: its size, or its reservation while it is written."""
+    """Return the bytes of the quota that an upload uses: its size, or its reservation while it is written, if larger."""
     file = content(folder)
     held = 0
     with suppress(FileNotFoundError):

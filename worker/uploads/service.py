@@ -25,7 +25,7 @@ MAX_UPLOADS = 100
 """Maximum number of uploads per owner."""
 
 LATE = timedelta(minutes=10)
-"""Time after its expiry from which fsck reports an upload."""
+"""Time after its expiry at which fsck reports an upload that still exists."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +52,7 @@ class Uploads:
         Raises
         ------
         UnknownUpload
-            There is no upload of that id.
+            No upload has this id.
         """
         folder = self._folder(id)
         file = content(folder)
@@ -73,7 +73,7 @@ class Uploads:
         )
 
     def find(self, id: str) -> Upload | None:
-        """Return the state of an upload, None if there is no upload of that id."""
+        """Return the state of an upload, None if no upload has this id."""
         with suppress(UnknownUpload):
             return self.get(id)
         return None
@@ -82,7 +82,7 @@ class Uploads:
     def write(self, id: str, *, offset: int, length: int | None, capacity: Capacity) -> Iterator[Writer]:
         """Resume an upload, or start it at offset 0, which discards an incomplete one of the same id.
 
-        `offset` must equal the current size of the upload; `length` is that of the complete one, if known.
+        `offset` must equal the current size of the upload in bytes; `length` is the size of the complete upload in bytes, if known.
 
         Raises
         ------
@@ -125,9 +125,9 @@ class Uploads:
         Raises
         ------
         UnknownUpload
-            There is no upload of that id.
+            No upload has this id.
         Conflict
-            It is not complete yet.
+            The upload is not complete yet.
         """
         file = content(self._folder(id))
         if file is None:
@@ -153,9 +153,9 @@ class Uploads:
         Raises
         ------
         UnknownUpload
-            There is no upload of that id.
+            No upload has this id.
         Conflict
-            It is being written.
+            The upload is being written.
         """
         folder = self._folder(id)
         with locked(folder, make=False, id=id):
@@ -182,7 +182,7 @@ class Uploads:
             names = sorted(path.name for path in folder.iterdir())
             contents = [name for name in names if name == PART or name.startswith(WHOLE)]
             if len(contents) != 1 or not set(names) <= {*contents, LENGTH, RESERVED}:
-                yield f"Upload {folder.name} holds {', '.join(names) or 'nothing'}, not one file."
+                yield f"Upload {folder.name} holds {', '.join(names) or 'nothing'}; expected exactly one file."
                 continue
             file = folder / contents[0]
             late = timedelta(seconds=self.expiry) + LATE

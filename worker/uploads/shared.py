@@ -1,7 +1,7 @@
-"""Uploads where files are in S3: any API process continues what another one began.
+"""Uploads of installations that store files in S3: any API process can continue an upload that another one began.
 
-The bytes are pieces in the blob store under `uploads/`, and the state is in Redis (`uploads.states`). A piece counts once the state
-names it, and only the newest request may add one, so nothing has to be locked or repaired.
+The bytes are stored as pieces in the blob store under `uploads/`, the state in Redis (`uploads.states`). A piece counts once the state
+names it, and only the newest request may add one, so neither locks nor repairs are needed.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from pliant.worker.uploads.states import State, UploadStates, open_states
 from pliant.worker.uploads.writer import Capacity, Writer, inconsistent
 
 FOLDER = "uploads/"
-"""Beginning of the blob keys."""
+"""Prefix of the blob keys."""
 
 PIECE = 4 << 20
-"""Bytes of a piece. This much of each upload is in memory; what is not stored yet when a process is killed is sent again."""
+"""Bytes of a piece, and of memory per upload. If a process is killed, its clients resend the bytes that are not stored yet."""
 
 STRAY = timedelta(hours=1)
-"""Age from which a piece that no state names is removed; a younger one may be about to be named."""
+"""Age above which a piece that no state names is removed; a younger one may not be named yet."""
 
 
 def open_uploads(settings: Settings, blobs: Blobs) -> Uploads:
-    """Return the uploads of an installation: shared where its files are in an object store, else in the data directory."""
+    """Return the uploads of an installation: shared if its files are in an object store, else in the data directory."""
     if not blobs.remote:
         return Uploads.open(settings)
     states = open_states(settings.redis, settings.queue)
@@ -99,7 +99,7 @@ class SharedUploads(Uploads):
             with to.open("wb") as out:
                 for chunk in self.read(id, state):
                     out.write(chunk)
-        except FileNotFoundError:  # deleted meanwhile
+        except FileNotFoundError:  # the upload was deleted meanwhile
             raise UnknownUpload(id) from None
         self.states.swap(self.name(id), state, state.model_copy(update={"touched": time.time()}))
         return state.sha256
@@ -142,7 +142,7 @@ class SharedUploads(Uploads):
                 yield f"File {key} belongs to no upload."
 
     def name(self, id: str) -> str:
-        """Return the name of an upload among all owners'.
+        """Return the name of an upload, which is unique across owners.
 
         Raises
         ------
@@ -159,13 +159,13 @@ class SharedUploads(Uploads):
         Raises
         ------
         FileNotFoundError
-            It was deleted meanwhile.
+            The upload was deleted meanwhile.
         """
         for key, size in state.pieces:
             yield self.blobs.read_range(f"{FOLDER}{self.name(id)}/{state.generation}/{key}", 0, size)
 
     def discard(self, name: str, state: State) -> bool:
-        """Remove an upload with its bytes if its state is still this one; return whether it was."""
+        """Remove an upload with its bytes if its state is unchanged; return whether it was removed."""
         if not self.states.swap(name, state, None):
             return False
         self.blobs.delete(f"{FOLDER}{name}/{state.generation}/")
@@ -192,7 +192,7 @@ class SharedWriter(Writer):
     before: State | None
     """The state that the request found."""
     _state: State | None = None
-    """The state that this request wrote last; None before and after."""
+    """The state that this request wrote last; None before `open` and after the writer has ended."""
     _unsent: bytearray = field(default_factory=bytearray)
 
     def open(self, offset: int) -> None:
@@ -215,7 +215,7 @@ class SharedWriter(Writer):
             raise
 
     def _append(self, piece: bytes) -> None:
-        """Keep bytes in memory until they are a piece. Raises Conflict if a newer request writes to this upload, or it was deleted."""
+        """Buffer bytes until they fill a piece. Raises Conflict if a newer request writes to this upload, or it was deleted."""
         self._unsent += piece
         self.offset += len(piece)
         if self._began == 0:
@@ -224,7 +224,7 @@ class SharedWriter(Writer):
             self._store()
 
     def _sha256(self) -> str:
-        """Store what is in memory; return the digest of the whole."""
+        """Store the buffered bytes; return the digest of the complete upload."""
         self._store()
         assert self._state is not None
         if self._began > 0:
@@ -249,7 +249,7 @@ class SharedWriter(Writer):
         return self.uploads.name(self.id)
 
     def _store(self) -> None:
-        """Store the bytes that are in memory, as one piece."""
+        """Store the buffered bytes as one piece."""
         if not self._unsent or self._state is None:
             return
         key, data = f"{len(self._state.pieces):05d}-{secrets.token_hex(4)}", bytes(self._unsent)
@@ -272,7 +272,7 @@ class SharedWriter(Writer):
 
     def _taken_over(self) -> Conflict:
         sentence = (
-            f"A newer request writes to upload {self.id!r}, or it was deleted. Ask for its offset before you continue."
+            f"A newer request writes to upload {self.id!r}, or it was deleted. Query its offset before you continue."
         )
         return Conflict("upload_taken_over", id=self.id, sentence=sentence)
 

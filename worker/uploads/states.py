@@ -1,4 +1,4 @@
-"""The state of uploads that several API processes share: one JSON text each in a Redis hash, written by compare-and-set."""
+"""State of uploads that several API processes share: one JSON text per upload in a Redis hash, written by compare-and-set."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pliant.worker.store.connection import connect, reachable
 from pydantic import BaseModel, ConfigDict
 
 RESERVED_FOR = 120.0
-"""Seconds that a reservation of quota holds without a new byte: its writer may have been killed."""
+"""Seconds after which a quota reservation without new bytes lapses, because its writer may have been killed."""
 
 COUNTING_WITHIN = 10.0
 """Seconds that one process may take to count and reserve space."""
@@ -27,20 +27,20 @@ return 1
 
 
 class State(BaseModel):
-    """What is known of one upload."""
+    """State of one upload."""
 
     model_config = ConfigDict(frozen=True)
 
     generation: str
-    """Of its bytes: an upload that is begun again has a new one. Part of their keys in the blob store."""
+    """Part of the blob keys of its pieces; restarting an upload begins a new generation."""
     writer: str
     """The request that may append; a newer request changes it."""
     pieces: tuple[tuple[str, int], ...] = ()
-    """Key under the generation, and bytes, of each stored piece."""
+    """Key within the generation, and size in bytes, of each stored piece."""
     length: int | None = None
     """Bytes of the complete upload, if known."""
     sha256: str | None = None
-    """Of the complete upload; None before."""
+    """SHA-256 of the complete upload; None until it is complete."""
     touched: float
     """Time of the last byte or use, seconds since 1970."""
     reserved: int = 0
@@ -48,11 +48,11 @@ class State(BaseModel):
 
     @property
     def offset(self) -> int:
-        """Stored bytes."""
+        """Number of stored bytes."""
         return sum(size for _, size in self.pieces)
 
     def taken(self, now: float) -> int:
-        """Bytes that it takes of the quota at a time in seconds since 1970."""
+        """Return the bytes of the quota that the upload uses at time `now`, seconds since 1970."""
         return max(self.offset, self.reserved if now < self.touched + RESERVED_FOR else 0)
 
 
@@ -82,7 +82,7 @@ class UploadStates:
             return list(self._redis.hkeys(self._key))
 
     def swap(self, name: str, before: State | None, after: State | None) -> bool:
-        """Replace a state if it is still `before`; return whether it was. None: there is no such upload."""
+        """Replace a state if it is still `before`; return whether it was replaced. None stands for no upload."""
         texts = ["" if each is None else each.model_dump_json() for each in (before, after)]
         with reachable():
             return bool(self._swap(keys=[self._key], args=[name, *texts]))
@@ -104,5 +104,5 @@ class UploadStates:
 
 @lru_cache(maxsize=8)
 def open_states(redis_url: str, queue: str) -> UploadStates:
-    """Return the states of an installation; the connections are shared by all that this process opens."""
+    """Return the states of an installation; the result is cached, so that all callers share its connections."""
     return UploadStates(connect(redis_url, decode=True), queue=queue)

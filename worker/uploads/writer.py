@@ -1,4 +1,4 @@
-"""Writing of an upload: append bytes, update the digest, enforce the limits."""
+"""Write an upload: append bytes, update the digest, enforce the limits."""
 
 from __future__ import annotations
 
@@ -76,11 +76,11 @@ class Writer:
         Raises
         ------
         InvalidRequest
-            They exceed the upload's length; none of them is written, and what was written before stays.
+            The bytes exceed the upload's length; none of them is written, and earlier bytes are kept.
         UploadTooLarge
             The upload exceeds its maximum size; it is removed, since it can never be completed.
         QuotaExceeded
-            The disk quota is reached; the same holds.
+            The disk quota is reached; none of the bytes is written, and earlier bytes are kept.
         OSError
             The disk is full; the bytes of this request are removed to free the space.
         """
@@ -109,7 +109,7 @@ class Writer:
         Raises
         ------
         InvalidRequest
-            Bytes are missing, or the digest differs; then the upload is removed.
+            Bytes are missing; or the digest differs, and the upload is removed.
         """
         if self.length is not None and self.offset != self.length:
             raise inconsistent(f"{self.length} bytes in all", str(self.offset))
@@ -144,7 +144,7 @@ class Writer:
             self._reservation = None
 
     def _sha256(self) -> str:
-        """Return the digest of the whole. One that came in several requests is read once, here: not at each of them."""
+        """Return the digest of the complete upload. After several requests the file is read once here, not in each of them."""
         if self._began == 0:
             return self._digest.hexdigest()
         with (self.folder / PART).open("rb") as whole:
@@ -162,7 +162,6 @@ class Writer:
         self._reserve(size)
 
     def _discard(self) -> None:
-        """Remove the upload."""
         self.close()
         shutil.rmtree(self.folder)
 

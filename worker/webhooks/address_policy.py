@@ -39,7 +39,7 @@ def checked_address(host: str, addresses: list[Address], networks: str) -> Addre
 
 
 def may_reach(address: Address, networks: str = "") -> bool:
-    """Whether a webhook may be sent to an address: a public one, or one of an allowed network.
+    """Return whether a webhook may be sent to an address: a public one, or one in an allowed network.
 
     An IPv6 address that embeds an IPv4 address (mapped, 6to4, NAT64, Teredo) is checked as the latter.
     """
@@ -57,7 +57,7 @@ def may_reach(address: Address, networks: str = "") -> bool:
 
 
 def _is_translated(address: Address) -> bool:
-    """Whether an IPv6 address only represents an IPv4 address and belongs to no network of its own."""
+    """Return whether an IPv6 address only represents an IPv4 address and belongs to no network of its own."""
     return isinstance(address, ipaddress.IPv6Address) and (address.ipv4_mapped is not None or address in _NAT64)
 
 

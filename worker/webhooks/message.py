@@ -1,6 +1,6 @@
 """The message of a webhook: its body, its signature, and the check of a submission's address and secret.
 
-Signed by the scheme of Standard Webhooks 1.0 (standardwebhooks.com): HMAC-SHA256 over ``id.timestamp.body``.
+Messages are signed as in Standard Webhooks 1.0 (standardwebhooks.com): HMAC-SHA256 over ``id.timestamp.body``.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ SECRET_BYTES = range(24, 65)
 
 
 def parse_webhook(url: str, secret: str, *, networks: str = "") -> Webhook | None:
-    """Return the webhook of a submission, None for an empty URL.
+    """Return the webhook of a submission, None if both URL and secret are empty.
 
-    The URL has ``http`` or ``https``, a host and no user name; the secret is ``whsec_`` and 24 to 64 random bytes in base64;
-    `networks` is `Settings.webhook_networks`.
+    The URL must be ``http`` or ``https`` with a host and without a user name. The secret must be ``whsec_`` followed by 24 to 64
+    random bytes in base64. `networks` is `Settings.webhook_networks`.
 
     Raises
     ------
@@ -73,8 +73,8 @@ def message(job: Job) -> bytes:
 def signed(secret: str, *, id: str, timestamp: int, body: bytes) -> dict[str, str]:
     """Return the headers by which the receiver verifies the sender and the age of a message.
 
-    The id is the same for all attempts at one message, so that the receiver recognises duplicates; the timestamp is of this
-    attempt.
+    The id is the same for all attempts at one message, so that the receiver recognises duplicates; the timestamp is the time of
+    this attempt.
     """
     key = _key(secret)
     assert key is not None, "checked when the job was submitted"

@@ -33,20 +33,20 @@ PAUSES = (5.0, 30.0, 120.0, 600.0, 1800.0, 7200.0, 21600.0, 54000.0)
 """Seconds between attempts, about a day in total; each is extended randomly by up to 20 %."""
 
 CONCURRENT = 16
-"""Messages sent at once."""
+"""Maximum number of messages sent at once."""
 
 PER_RECEIVER, PER_OWNER = 2, 8
-"""Messages sent at once to one host, and for jobs of one owner, so that slow receivers leave capacity for others."""
+"""Maximum number of messages sent at once to one host, and for one owner, so that slow receivers leave capacity for others."""
 
 POSTPONED = 2.0
-"""Seconds by which a message is postponed if its receiver or owner has reached `PER_RECEIVER`."""
+"""Seconds by which a message is postponed if its receiver has reached `PER_RECEIVER` or its owner `PER_OWNER`."""
 
 WITHIN = 20.0
 """Seconds that one attempt may take, from name resolution to the response headers."""
 
 LOOKUPS = 64
-"""Names looked up at once, in threads that do nothing else. A lookup cannot be stopped, and without an answer it takes longer than
-`WITHIN`: the resolver asks each of up to three servers twice for 5 s. An owner then holds twice `PER_OWNER` threads at most."""
+"""Maximum number of concurrent name lookups, in dedicated threads. A lookup cannot be cancelled, and without an answer it takes longer
+than `WITHIN`: the resolver queries each of up to three servers twice for 5 s. An owner then holds at most twice `PER_OWNER` threads."""
 
 LEASE = 60.0
 """Seconds after which a message leased by a killed process is sent by another; more than `WITHIN`."""
@@ -69,7 +69,7 @@ class WebhookSender:
     """Seconds since 1970."""
     pauses: tuple[float, ...] = PAUSES
     trusted: ssl.SSLContext = field(default_factory=lambda: trusted_by_default())
-    """Authorities whose certificates are trusted."""
+    """TLS context with the trusted certificate authorities."""
     _lookups: ThreadPoolExecutor = field(
         default_factory=lambda: ThreadPoolExecutor(LOOKUPS, thread_name_prefix="webhook names")
     )
@@ -105,7 +105,7 @@ class WebhookSender:
             self._lookups.shutdown(wait=False, cancel_futures=True)
 
     async def _send_due(self) -> None:
-        """Send what is due until the sender is stopped."""
+        """Send due messages until the sender is stopped."""
         under_way: set[asyncio.Task[None]] = set()
         busy: Counter[str] = Counter()
         while not self._ended.is_set():
@@ -129,7 +129,7 @@ class WebhookSender:
             task.cancel()
 
     def _take(self, busy: Counter[str]) -> tuple[str, int, list[str]] | None:
-        """Lease a due message whose receiver and owner are below `PER_RECEIVER`; postpone the others.
+        """Lease a due message whose receiver and owner are below their limits; postpone the others.
 
         Returns the job's id, the number of attempts including this one, and the keys of receiver and owner in `busy`.
         """
@@ -156,7 +156,7 @@ class WebhookSender:
                 stored = await asyncio.to_thread(self.records.get, id)
             except UnknownJob:
                 return await asyncio.to_thread(self.outbox.given_up, id)
-            if stored.webhook is None or tries > len(self.pauses) + 1:  # killed attempts count
+            if stored.webhook is None or tries > len(self.pauses) + 1:  # attempts of killed processes count, too
                 return await asyncio.to_thread(self._give_up, id, "the maximum number of attempts is reached.")
             body = message(stored.job)
             try:
@@ -221,7 +221,7 @@ class WebhookSender:
         self.outbox.later(id, due=int((self.clock() + pause) * 1000))
 
     def _give_up(self, id: str, why: str) -> None:
-        self._log(id, f"Webhook given up: {why}")
+        self._log(id, f"Webhook abandoned: {why}")
         self.outbox.given_up(id)
 
     def _log(self, id: str, sentence: str) -> None:
@@ -230,7 +230,7 @@ class WebhookSender:
 
 
 def trusted_by_default() -> ssl.SSLContext:
-    """Trust the system's authorities, among them a company's own, and those of certifi where the system has none."""
+    """Return a TLS context that trusts certifi's authorities and the system's, among them a company's own."""
     import httpx
 
     context = httpx.create_ssl_context(trust_env=False)  # certifi's
@@ -239,7 +239,7 @@ def trusted_by_default() -> ssl.SSLContext:
 
 
 def _release(busy: Counter[str], limits: list[str], _: asyncio.Task[None]) -> None:
-    busy -= Counter(limits)  # in place, and without what is at zero
+    busy -= Counter(limits)  # in place; drops counts of zero
 
 
 def _log_error(task: asyncio.Task[None]) -> None:
@@ -249,7 +249,7 @@ def _log_error(task: asyncio.Task[None]) -> None:
 
 
 def _failures() -> tuple[type[Exception], ...]:
-    """Return the exceptions of a failed request; TimeoutError is an OSError, too long a host label raises UnicodeError."""
+    """Return the exceptions of a failed request; TimeoutError is an OSError, and too long a host label raises UnicodeError."""
     import httpx
 
     return OSError, UnicodeError, httpx.TransportError, httpx.InvalidURL

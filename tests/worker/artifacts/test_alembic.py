@@ -58,7 +58,7 @@ def test_every_frame_has_its_points(tmp_path: Path, mesh: str, y_axis: str) -> N
     np.testing.assert_array_equal(np.reshape(list(sample.getFaceIndices()), faces.shape)[:, ::-1], faces)
 
 
-def test_texture_coordinates_have_their_origin_below(tmp_path: Path) -> None:
+def test_texture_coordinates_start_at_the_bottom_left(tmp_path: Path) -> None:
     made = make_result(texture=True, outputs="abc")
     schema, _, _archive = child(write(tmp_path, made), "mesh")
     found = schema.getUVsParam().getExpandedValue().getVals()
@@ -78,7 +78,7 @@ def test_points_without_a_mesh_stay_points(tmp_path: Path) -> None:
     assert list(sample.getIds()) == list(range(30))
 
 
-def test_equal_results_are_equal_files(tmp_path: Path) -> None:
+def test_equal_results_give_identical_files(tmp_path: Path) -> None:
     first, second = (write(tmp_path / name, make_result(texture=True, outputs="abc")) for name in ("a", "b"))
     assert first.read_bytes() == second.read_bytes()
     assert sorted(path.name for path in first.parent.iterdir()) == [
@@ -89,7 +89,7 @@ def test_equal_results_are_equal_files(tmp_path: Path) -> None:
     ]
 
 
-def test_without_the_package_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_alembic_output_is_refused_without_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pliant.worker.artifacts.scenes.alembic.available", lambda: False)
     with pytest.raises(InvalidInput, match=r"pliant\[alembic\]") as refused:
         kinds_for(Options(outputs=("abc",)))

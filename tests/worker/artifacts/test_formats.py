@@ -157,7 +157,7 @@ def test_mat_holds_the_arrays_of_the_npz(tmp_path: Path, mesh: str) -> None:
     assert scipy.io.whosmat(files["shapes.mat"])[0] == ("shapes", (7, 30, 3), "double")
 
 
-def test_tables_agree_with_the_metrics(tmp_path: Path) -> None:
+def test_csv_tables_agree_with_the_metrics(tmp_path: Path) -> None:
     made = make_result(truth=True, outputs="csv", fps=12.5)
     inputs, solution, _ = made
     files = write(tmp_path, made)
@@ -174,7 +174,7 @@ def test_tables_agree_with_the_metrics(tmp_path: Path) -> None:
     np.testing.assert_allclose(points["reprojection_rms"], np.sqrt(np.square(solution.residuals).mean(axis=0)))
 
 
-def test_tables_leave_out_what_was_hidden(tmp_path: Path) -> None:
+def test_csv_tables_exclude_hidden_observations(tmp_path: Path) -> None:
     made = make_result(hidden=True, outputs="csv")
     inputs, solution, _ = made
     files = write(tmp_path, made)
@@ -190,7 +190,7 @@ def test_tables_leave_out_what_was_hidden(tmp_path: Path) -> None:
     assert points["reprojection_median"][7] == np.median(solution.residuals[some > 0, 7])
 
 
-def test_ply_carries_normals_and_colours_of_its_frame(tmp_path: Path) -> None:
+def test_each_ply_frame_has_its_own_normals_and_colours(tmp_path: Path) -> None:
     made = make_result(truth=True, outputs="ply", normals="animated", colours="error", axes="tracks")
     inputs, solution, _ = made
     files = write(tmp_path, made)
@@ -215,7 +215,7 @@ def test_ply_carries_normals_and_colours_of_its_frame(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("axes", "y_axis", "turned"), [("viewer", "down", True), ("viewer", "up", False), ("tracks", "down", False)]
 )
-def test_meshes_have_the_axes_of_the_glb_on_request(tmp_path: Path, axes: str, y_axis: str, turned: bool) -> None:
+def test_ply_and_obj_use_the_requested_axes(tmp_path: Path, axes: str, y_axis: str, turned: bool) -> None:
     made = make_result(outputs="ply,obj", axes=axes, y_axis=y_axis)
     files = write(tmp_path, made)
     expected = (made[1].shapes[2] * ([1, -1, -1] if turned else [1, 1, 1])).astype(np.float32)
@@ -228,7 +228,7 @@ def test_meshes_have_the_axes_of_the_glb_on_request(tmp_path: Path, axes: str, y
     assert lines[0].startswith(f"# x right, y {'up' if up else 'down'}, z {'towards' if up else 'away from'}")
 
 
-def test_obj_colours_are_read_by_other_programs(tmp_path: Path) -> None:
+def test_obj_vertex_colours_are_read_by_trimesh(tmp_path: Path) -> None:
     made = make_result(outputs="obj", axes="tracks", normals="static", colours="error", hidden=True)
     inputs, solution, _ = made
     files = write(tmp_path, made)
@@ -242,7 +242,7 @@ def test_obj_colours_are_read_by_other_programs(tmp_path: Path) -> None:
     assert description(files, "shapes_obj.zip")["colours"]["quantity"] == "reprojection residual"
 
 
-def test_expected_error_is_painted_in_percent_and_hidden_positions_grey(tmp_path: Path) -> None:
+def test_expected_error_colours_are_in_percent_and_hidden_points_are_grey(tmp_path: Path) -> None:
     made = make_result(outputs="ply,glb", colours="expected_error", hidden=True, truth=True)
     inputs, solution, _ = made
     files = write(tmp_path, made)
@@ -261,7 +261,7 @@ def test_expected_error_is_painted_in_percent_and_hidden_positions_grey(tmp_path
     assert b"(percent of the object's size) and above" in members(files["shapes_ply.zip"])[0]
 
 
-def test_colours_mean_over_what_was_seen() -> None:
+def test_mean_colours_use_only_visible_observations() -> None:
     values = np.array([[1.0, 2.0, 9.0], [3.0, 9.0, 9.0]])
     known = np.array([[True, True, False], [True, False, False]])
     painting = Painting.of("x", values, known)
@@ -271,14 +271,14 @@ def test_colours_mean_over_what_was_seen() -> None:
     assert Painting.of("x", np.zeros((2, 3))).top == 1.0
 
 
-def test_the_scale_of_colours_rises_in_lightness_and_ends_as_stated() -> None:
+def test_the_colour_map_rises_in_lightness_and_clamps_at_its_ends() -> None:
     light = linear(shade(np.linspace(0, 1, 50))) @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(light) > 0).all()
     np.testing.assert_array_equal(shade(np.array([0.0, 1.0, 7.0])), STOPS[[0, -1, -1]])
     np.testing.assert_allclose(linear(np.array([0.0, 0.02, 0.5, 1.0])), [0, 0.02 / 12.92, 0.21404, 1], atol=1e-5)
 
 
-def test_equal_results_are_equal_files_in_every_format(tmp_path: Path) -> None:
+def test_equal_results_give_identical_files_in_every_format(tmp_path: Path) -> None:
     wanted = {"outputs": "glb,ply,obj,usd,mat,csv", "colours": "error", "normals": "animated", "truth": True}
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
@@ -287,7 +287,7 @@ def test_equal_results_are_equal_files_in_every_format(tmp_path: Path) -> None:
         assert first[name].read_bytes() == second[name].read_bytes(), name
 
 
-def test_usd_is_rejected_where_it_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_usd_is_rejected_before_computing_without_usd_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "pxr" else find(name, *rest))
     with pytest.raises(InvalidInput, match="usd-core") as refused:
@@ -313,7 +313,7 @@ def test_mat_files_above_2_gib_are_rejected_before_computing(tmp_path: Path, mon
         pipeline.reconstruct(inputs, options, tmp_path)
 
 
-def test_a_usd_that_fails_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_usd_write_leaves_no_partial_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 

@@ -27,7 +27,7 @@ from results import make_result
 
 LONG = "a b " * 50
 NAMES = {
-    # name: as glTF has it, as USD and Alembic have it, in the header of PLY, in OBJ
+    # name: as written in glTF, in USD and Alembic, in the PLY header, in OBJ
     "": ("shape", "shape", "shape", "shape"),
     "face": ("face", "face", "face", "face"),
     "my face/left": ("my face/left", "my_face_left", "my face/left", "my_face_left"),
@@ -51,7 +51,7 @@ def write(folder: Path, name: str, **made: object) -> Path:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_file_carries_the_name_of_the_job(tmp_path: Path, name: str) -> None:
+def test_every_file_contains_the_name_of_the_job(tmp_path: Path, name: str) -> None:
     folder = write(tmp_path, name)
     gltf, usd, ply, obj = NAMES[name]
 
@@ -104,19 +104,19 @@ def test_point_names_are_in_the_arrays_the_table_and_the_preview(tmp_path: Path)
     assert "name" not in (tmp_path / "metrics_points.csv").read_text().splitlines()[0].split(",")
 
 
-def test_a_texture_hangs_below_the_name(tmp_path: Path) -> None:
+def test_usd_materials_are_nested_under_the_job_name(tmp_path: Path) -> None:
     write(tmp_path, "left half", texture=True)
     stage = Usd.Stage.Open(str(tmp_path / "shapes.usdz"))
     assert {str(prim.GetPath()) for prim in stage.Traverse()} >= {"/left_half", "/left_half/film/surface"}
 
 
-def test_the_name_is_in_the_report_and_as_long_as_a_job_may_have(tmp_path: Path) -> None:
+def test_a_long_name_is_whole_in_the_report_and_truncated_in_the_glb(tmp_path: Path) -> None:
     write(tmp_path, "x" * 300)
     assert json.loads((tmp_path / "report.json").read_text())["name"] == "x" * 300
     assert list(trimesh.load(tmp_path / "shapes.glb", process=False).geometry) == ["x" * MAX_OBJECT_NAME]
 
 
-def test_a_reconstruction_hands_its_name_to_the_files(tmp_path: Path) -> None:
+def test_reconstruct_writes_the_given_name_to_the_files(tmp_path: Path) -> None:
     inputs, solution, _ = make_result()
     pipeline.reconstruct(inputs, Options(), tmp_path, name="take 1", solver=lambda *_, **__: solution)
     assert list(trimesh.load(tmp_path / "shapes.glb", process=False).geometry) == ["take 1"]

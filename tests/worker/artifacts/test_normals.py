@@ -46,7 +46,7 @@ def test_fitted_normals_are_within_their_bound_with_fewer_targets_than_modes() -
     np.testing.assert_allclose(np.linalg.norm(fitted.base, axis=1), 1, atol=1e-5)
 
 
-def test_normals_of_a_still_body_do_not_move() -> None:
+def test_a_static_shape_has_static_normals() -> None:
     shapes, triangles = rippled(5)
     animation = animate(np.repeat(shapes[1:2], 5, axis=0))
     fitted = fit_normals(animation, triangles)
@@ -54,7 +54,7 @@ def test_normals_of_a_still_body_do_not_move() -> None:
     np.testing.assert_allclose(fitted.targets, 0, atol=1e-5)
 
 
-def test_a_normal_that_turns_right_over_keeps_unit_length() -> None:
+def test_a_normal_that_flips_keeps_unit_length() -> None:
     """Up in half of the frames, down in the others: the constant part has length zero."""
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     turned = square * (1, -1, 1)
@@ -72,7 +72,7 @@ def written(path: Path, *, quantized: bool) -> tuple[np.ndarray, pygltflib.GLTF2
 
 @pytest.mark.node
 @pytest.mark.parametrize("quantized", [False, True])
-def test_targets_without_normals_share_zeros_that_take_no_bytes(tmp_path: Path, quantized: bool) -> None:
+def test_targets_without_normals_share_one_accessor_without_data(tmp_path: Path, quantized: bool) -> None:
     _, gltf = written(tmp_path / "x.glb", quantized=quantized)
     assert_valid(tmp_path / "x.glb")
     told = gltf.meshes[0].extras["pliant"]
@@ -85,7 +85,7 @@ def test_targets_without_normals_share_zeros_that_take_no_bytes(tmp_path: Path, 
 
 @pytest.mark.chromium
 @pytest.mark.parametrize("quantized", [False, True])
-def test_three_js_shades_the_frames_as_true_normals_do(tmp_path: Path, quantized: bool) -> None:
+def test_three_js_shading_matches_that_of_true_normals(tmp_path: Path, quantized: bool) -> None:
     shapes, _ = written(tmp_path / "x.glb", quantized=quantized)
     with three_page() as page:
         played = Played(page, tmp_path / "x.glb")

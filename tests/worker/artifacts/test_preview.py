@@ -28,7 +28,7 @@ def sequence() -> Sequence:
 
 
 def solution_of(sequence: Sequence, *, mirrored: bool = False) -> Solution:
-    """The truth itself as a solution, or its bas-relief mirror, which explains the tracks as well."""
+    """The truth itself as a solution, or its bas-relief mirror, which fits the tracks equally well."""
     flip = np.diag([1.0, 1.0, -1.0 if mirrored else 1.0])
     shapes = (sequence.shapes - sequence.shapes.mean(axis=1, keepdims=True)) @ flip
     rotations = flip @ sequence.rotations @ flip
@@ -79,7 +79,7 @@ def world(header: dict[str, Any], values: NDArray[Any]) -> NDArray[np.float64]:
     return np.array(header["origin"]) + header["step"] * values
 
 
-def test_positions_come_back_within_half_a_step(sequence: Sequence, tmp_path: Path) -> None:
+def test_positions_round_trip_within_half_a_quantization_step(sequence: Sequence, tmp_path: Path) -> None:
     solution = solution_of(sequence)
     path = tmp_path / preview.NAME
     write(path, tracks=sequence.tracks, mesh=sequence.mesh, solution=solution, y_axis="up", fps=12)
@@ -93,7 +93,7 @@ def test_positions_come_back_within_half_a_step(sequence: Sequence, tmp_path: Pa
     assert "truth" not in arrays
 
 
-def test_residuals_lead_from_the_projection_to_the_track(sequence: Sequence, tmp_path: Path) -> None:
+def test_projections_plus_residuals_give_the_tracks(sequence: Sequence, tmp_path: Path) -> None:
     solution = solution_of(sequence)
     path = tmp_path / preview.NAME
     write(path, tracks=sequence.tracks, mesh=None, solution=solution)
@@ -132,7 +132,7 @@ def test_truth_is_aligned_as_for_e3d_frame(sequence: Sequence, tmp_path: Path, m
     assert (apart[:, 7] == 0).all()
 
 
-def test_tables_state_how_often_points_were_seen_and_what_is_uncertain(sequence: Sequence, tmp_path: Path) -> None:
+def test_tables_hold_visibility_rejections_and_uncertainty(sequence: Sequence, tmp_path: Path) -> None:
     exact = solution_of(sequence)
     seen = sequence.tracks.visible > 0
     weights = seen.astype(float)
@@ -156,7 +156,7 @@ def test_tables_state_how_often_points_were_seen_and_what_is_uncertain(sequence:
     assert table[:, 4].max() < 1e-6
 
 
-def test_without_posterior_and_truth_their_columns_are_unknown(sequence: Sequence, tmp_path: Path) -> None:
+def test_columns_are_nan_without_posterior_and_truth(sequence: Sequence, tmp_path: Path) -> None:
     path = tmp_path / preview.NAME
     write(path, tracks=sequence.tracks, mesh=None, solution=solution_of(sequence))
     header, arrays = read(path)
@@ -173,7 +173,7 @@ def test_truth_of_too_few_points_is_omitted(sequence: Sequence, tmp_path: Path) 
     assert "truth" not in read(path)[0]["sections"]
 
 
-def test_a_long_sequence_is_thinned_evenly_and_keeps_its_pace(
+def test_a_long_sequence_is_subsampled_evenly_and_keeps_its_speed(
     sequence: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(preview, "MOST_OBSERVATIONS", F * P // 2)
@@ -206,7 +206,7 @@ def test_a_perfect_fit_has_a_positive_residual_step(tmp_path: Path) -> None:
     assert np.abs(header["residual_step"] * arrays["residuals"]).max() < 1e-9
 
 
-def test_a_films_picture_and_the_points_in_it_come_back(sequence: Sequence, tmp_path: Path) -> None:
+def test_a_films_picture_and_texture_coordinates_round_trip(sequence: Sequence, tmp_path: Path) -> None:
     places = np.random.default_rng(0).random((P, 2))
     texture = Texture.from_tracked(np.full((8, 10, 3), (200, 90, 30), dtype=np.uint8), places)
     path = tmp_path / preview.NAME

@@ -1,4 +1,4 @@
-"""The report of a job, and what the arrays hold beside it."""
+"""The report of a job, and the matching arrays of `shapes.npz`."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_the_report_describes_the_computation(tmp_path: Path) -> None:
     assert set(report["versions"]) == {"pliant", "numpy", "scipy", "python", "system"}
 
 
-def test_the_report_states_how_far_to_trust_the_result(tmp_path: Path) -> None:
+def test_the_report_contains_the_verdict_and_the_expected_error(tmp_path: Path) -> None:
     made = make_result(hidden=True)
     report = json.loads(write(tmp_path, made)["report.json"].read_text())
     trust = made[1].trust
@@ -108,7 +108,7 @@ def test_the_report_states_how_far_to_trust_the_result(tmp_path: Path) -> None:
     assert silent["verdict_reasons"] == []
 
 
-def test_a_result_without_deviations_has_no_such_array(tmp_path: Path) -> None:
+def test_without_standard_deviations_there_is_no_such_array_or_colour(tmp_path: Path) -> None:
     files = write(tmp_path, make_result(std=False, outputs="glb", colours="expected_error"))
     with np.load(files["shapes.npz"]) as arrays:
         assert "shapes_std" not in arrays

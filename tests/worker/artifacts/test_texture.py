@@ -33,7 +33,7 @@ def write(directory: Path, made) -> dict[str, Path]:  # type: ignore[no-untyped-
 
 
 def expected_colours(texture: Texture) -> np.ndarray:
-    """The picture's own formula at the texel centres around each place, sRGB in [0, 1]."""
+    """The formula of `make_texture`, interpolated between texel centres at each point; sRGB in [0, 1]."""
     red = (texture.uv[:, 0] * texture.width - 0.5) / (texture.width - 1)
     green = (texture.uv[:, 1] * texture.height - 0.5) / (texture.height - 1)
     return np.column_stack([red, green, np.full(len(red), 128 / 255)])
@@ -59,11 +59,11 @@ def test_glb_embeds_the_picture(tmp_path: Path, frames: int, quantized: bool, no
         warnings.simplefilter("ignore")
         read = trimesh.load(path, process=False).geometry["shape"]
     assert read.visual.material.baseColorTexture.size == (128, 96)
-    # trimesh turns v to point up.
+    # trimesh flips v to point up.
     np.testing.assert_allclose(read.visual.uv, np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]), atol=1e-6)
 
 
-def test_a_point_cloud_has_the_colours_of_the_picture(tmp_path: Path) -> None:
+def test_a_point_cloud_takes_its_colours_from_the_picture(tmp_path: Path) -> None:
     made = make_result(mesh="none", texture=True, outputs="glb")
     gltf = pygltflib.GLTF2.load_binary(write(tmp_path, made)["shapes.glb"])
     assert gltf.images == []
@@ -75,7 +75,7 @@ def test_a_point_cloud_has_the_colours_of_the_picture(tmp_path: Path) -> None:
     np.testing.assert_allclose(colours[:, :3], linear(expected_colours(made[0].texture)), atol=0.02)
 
 
-def test_colours_by_error_replace_the_picture(tmp_path: Path) -> None:
+def test_error_colours_replace_the_texture(tmp_path: Path) -> None:
     files = write(tmp_path, make_result(texture=True, outputs="glb,obj", colours="error"))
     gltf = pygltflib.GLTF2.load_binary(files["shapes.glb"])
     assert gltf.images == []
@@ -84,7 +84,7 @@ def test_colours_by_error_replace_the_picture(tmp_path: Path) -> None:
         assert all(name.endswith(".obj") for name in archive.namelist())
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # trimesh warns while it looks for seams, which there are none of
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # trimesh looks for seams and warns that there are none
 @pytest.mark.parametrize("normals", ["static", "animated"])
 def test_obj_comes_with_material_and_picture(tmp_path: Path, normals: str) -> None:
     made = make_result(texture=True, outputs="obj", normals=normals, axes="tracks")
@@ -94,7 +94,7 @@ def test_obj_comes_with_material_and_picture(tmp_path: Path, normals: str) -> No
         assert archive.namelist()[:3] == ["shapes.mtl", "texture.jpg", "frame_00000.obj"]
     assert (tmp_path / "out" / "texture.jpg").read_bytes() == texture.jpeg
     read = trimesh.load(tmp_path / "out" / "frame_00004.obj", process=False)
-    # trimesh has its own order of vertices; no two points of the sheet coincide.
+    # trimesh reorders the vertices; no two points of the sheet coincide.
     distances = np.linalg.norm(read.vertices[None] - made[1].shapes[4][:, None], axis=2)
     order = distances.argmin(axis=1)
     assert sorted(order) == list(range(30))
@@ -117,7 +117,7 @@ def test_ply_has_the_colours_of_the_picture(tmp_path: Path) -> None:
     assert b"colour: the film's template frame" in contents[0]
 
 
-def test_usd_is_a_package_with_material_and_picture(tmp_path: Path) -> None:
+def test_usdz_contains_the_material_and_the_picture(tmp_path: Path) -> None:
     from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 
     made = make_result(texture=True, outputs="usd", normals="animated")
@@ -146,7 +146,7 @@ def test_usd_is_a_package_with_material_and_picture(tmp_path: Path) -> None:
     assert [error.GetMessage() for error in found] == []
 
 
-def test_a_package_that_usd_cannot_write_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_usdz_write_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from pxr import UsdUtils
 
     monkeypatch.setattr(UsdUtils, "CreateNewUsdzPackage", lambda *_: False)
@@ -155,7 +155,7 @@ def test_a_package_that_usd_cannot_write_is_an_error(tmp_path: Path, monkeypatch
     assert {path.name for path in tmp_path.iterdir()} == {"shapes.npz"}
 
 
-def test_equal_textured_results_are_equal_files(tmp_path: Path) -> None:
+def test_equal_textured_results_give_identical_files(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
     first, second = (

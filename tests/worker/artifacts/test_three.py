@@ -25,7 +25,7 @@ def page() -> Iterator[Page]:
 
 @pytest.fixture
 def played(page: Page, tmp_path: Path):
-    """Write a result and open its glTF; also the shapes of its NPZ, in the scene's axes and size."""
+    """Write a result, open its glTF, and return the shapes of its NPZ in the scene's axes and size too."""
 
     def opened(*sizes: int, **wishes: object) -> tuple[Played, np.ndarray]:
         inputs, solution, options = make_result(*sizes, **wishes)
@@ -59,7 +59,7 @@ def test_every_vertex_matches_the_npz(played, wishes: dict[str, object], bound: 
     assert np.abs(shapes[5] - shapes[0]).max() > 1000 * bound * size
 
 
-def test_modes_are_played_within_their_bound(played) -> None:
+def test_modes_play_back_within_their_error_bound(played) -> None:
     shown, shapes = played(230, 5, 6, fps=10)
     assert shown.targets < 20
     diagonal = np.linalg.norm(np.ptp(shapes, axis=(0, 1)))
@@ -70,7 +70,7 @@ def test_modes_are_played_within_their_bound(played) -> None:
 
 @pytest.mark.parametrize("wishes", [{}, {"glb_quantized": True, "colours": "error"}])
 def test_rendered_vertices_match_the_npz(page: Page, played, wishes: dict[str, object]) -> None:
-    """Positions are computed again by the shader; a wrong target, weight or normal would show."""
+    """The shader recomputes the positions, so a wrong target, weight or normal is visible."""
     shown, shapes = played(9, 20, 24, fps=10, normals="animated", **wishes)
     for frame in (0, 4, 8):
         moved = shown.picture(frame / 10)

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 def turning_camera(
     frames: int, *, focal: float | None, y_up: bool, centre: tuple[float, float] = (319.5, 239.5)
 ) -> Camera:
-    """A camera that turns by more than half a turn, so that quaternions would change their sign."""
+    """A camera that turns by more than half a turn, so that quaternion signs would flip."""
     rotations = Rotation.from_rotvec(np.linspace(0, 4, frames)[:, None] * np.array([0.3, 0.9, 0.2])).as_matrix()
     scales = np.linspace(0.9, 1.1, frames) if focal is not None else np.ones(frames)
     shift = np.column_stack([np.linspace(-20, 20, frames), np.linspace(10, -5, frames)])
@@ -46,7 +46,7 @@ def projection_matrix(lens: dict[str, object]) -> np.ndarray:
 def seen_by(
     lens: dict[str, object], turns: np.ndarray, places: np.ndarray, points: np.ndarray, y_axis: str
 ) -> np.ndarray:
-    """Pixels `(F, P, 2)` of scene points `(F, P, 3)`; they lie between the planes near and far."""
+    """Pixels `(F, P, 2)` of scene points `(F, P, 3)`; they must lie between the near and far planes."""
     inside = np.einsum("fji,fpj->fpi", Rotation.from_quat(turns).as_matrix(), points - places[:, None])
     clip = np.concatenate([inside, np.ones((*inside.shape[:2], 1))], axis=2) @ projection_matrix(lens).T
     device = clip[..., :3] / clip[..., 3:]
@@ -72,7 +72,7 @@ def test_a_vertex_lands_on_its_pixel(
     assert (np.einsum("fi,fi->f", view.rotations[1:], view.rotations[:-1]) > 0).all()
 
 
-def test_the_view_is_the_picture_where_the_principal_point_is_its_centre() -> None:
+def test_the_view_equals_the_picture_if_the_principal_point_is_centred() -> None:
     view = view_of(
         turning_camera(5, focal=700.0, y_up=False), moving_sheet(5, 4, 4), y_axis="down", scale=1.0, image_size=(640.0, 480.0)
     )  # fmt: skip
@@ -81,7 +81,7 @@ def test_the_view_is_the_picture_where_the_principal_point_is_its_centre() -> No
     np.testing.assert_allclose(view.lens["perspective"]["yfov"], 2 * np.arctan(240 / 700))
 
 
-def test_scales_that_change_are_stated_and_the_middle_one_is_taken() -> None:
+def test_varying_scales_use_the_middle_one_and_state_their_range() -> None:
     camera = replace(turning_camera(5, focal=None, y_up=False), scales=np.geomspace(0.8, 1.25, 5))
     view = view_of(camera, moving_sheet(5, 4, 4), y_axis="down", scale=1.0, image_size=(640.0, 480.0))
     assert view.lens["extras"]["pliant"]["scale_range"] == pytest.approx([0.8, 1.25])
@@ -89,7 +89,7 @@ def test_scales_that_change_are_stated_and_the_middle_one_is_taken() -> None:
 
 
 @pytest.mark.parametrize("focal", [700.0, None], ids=["perspective", "orthographic"])
-def test_the_file_holds_a_moving_camera_and_is_valid(tmp_path: Path, focal: float | None) -> None:
+def test_the_glb_contains_a_valid_animated_camera(tmp_path: Path, focal: float | None) -> None:
     inputs, solution, _ = make_result()
     camera = turning_camera(7, focal=focal, y_up=False)
     options = Options(image_size="640x480", outputs=("glb",), glb_quantized=True)

@@ -27,7 +27,7 @@ WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 def accessor(gltf: pygltflib.GLTF2, index: int) -> np.ndarray:
-    """An accessor's values by pygltflib's parse of the file; the binary part as it is."""
+    """An accessor's values, decoded from the binary chunk as the JSON that pygltflib parsed describes it."""
     described = gltf.accessors[index]
     view = gltf.bufferViews[described.bufferView]
     dtype, width = np.dtype(DTYPES[described.componentType]), WIDTHS[described.type]
@@ -45,7 +45,7 @@ def accessor(gltf: pygltflib.GLTF2, index: int) -> np.ndarray:
 
 
 def played(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every frame as a viewer shows it, in the node's own units times its scale; times; triangles."""
+    """Every frame as a viewer shows it, with the node's transform; the times; the triangles."""
     gltf = pygltflib.GLTF2.load_binary(path)
     primitive = gltf.meshes[0].primitives[0]
     base = accessor(gltf, primitive.attributes.POSITION)
@@ -104,7 +104,7 @@ def test_glb_plays_every_frame_exactly(tmp_path: Path, mesh: str, y_axis: str) -
     assert report["artifacts"]["shapes.glb"]["targets"] == 7
 
 
-def test_a_long_animation_is_written_in_modes_within_its_stated_bound(tmp_path: Path) -> None:
+def test_a_long_animation_is_stored_as_modes_within_its_error_bound(tmp_path: Path) -> None:
     made = make_result(230, 4, 5)
     files = write(tmp_path, made)
     shapes = upright(made[1].shapes, "down")
@@ -119,7 +119,7 @@ def test_a_long_animation_is_written_in_modes_within_its_stated_bound(tmp_path: 
     assert json.loads(files["report.json"].read_text())["artifacts"]["shapes.glb"]["max_error"] == details["max_error"]
 
 
-def test_a_short_animation_is_written_in_modes_where_that_is_smaller(tmp_path: Path) -> None:
+def test_a_short_animation_is_stored_as_modes_if_that_is_smaller(tmp_path: Path) -> None:
     made = make_result(40, 12, 15)
     exact = make_result(40, 12, 15, glb_motion="frames")
     for folder in ("modes", "frames"):
@@ -137,13 +137,13 @@ def test_a_short_animation_is_written_in_modes_where_that_is_smaller(tmp_path: P
     assert (details["encoding"], details["targets"] < 40) == ("modes", True)
 
 
-def test_motion_of_full_rank_takes_one_target_less_than_frames() -> None:
+def test_full_rank_motion_needs_one_target_fewer_than_frames() -> None:
     details = animate(np.random.default_rng(0).normal(size=(6, 30, 3))).extras
     assert details["targets"] == 5
     assert details["max_error"] < 1e-6
 
 
-def test_every_file_of_a_job_shows_the_same_pose(tmp_path: Path) -> None:
+def test_all_formats_show_the_same_pose(tmp_path: Path) -> None:
     made = make_result(9, 6, 7, outputs="glb,ply,obj,usd,mdd", glb_motion="frames", normals="static")
     files = write(tmp_path, made)
     shown, times, _ = played(files["shapes.glb"])
@@ -198,7 +198,7 @@ def test_glb_passes_the_khronos_validator(tmp_path: Path, frames: int, mesh: str
 @pytest.mark.node
 @pytest.mark.parametrize("quantized", [False, True])
 @pytest.mark.parametrize("normals", ["none", "animated"])
-def test_every_variant_passes_and_plays(tmp_path: Path, quantized: bool, normals: str) -> None:
+def test_every_glb_variant_is_valid_and_plays_back(tmp_path: Path, quantized: bool, normals: str) -> None:
     shapes = moving_sheet(9, 5, 7)
     triangles = triangles_of(make_result(9, 5, 7)[0].mesh.faces)  # type: ignore[union-attr]
     colours = np.full((35, 4), 50_000, dtype=np.uint16)
@@ -276,7 +276,7 @@ def test_ply_zip_holds_every_frame(tmp_path: Path) -> None:
             np.testing.assert_array_equal(np.stack(content["face"]["vertex_indices"]), inputs.mesh.faces)
 
 
-def test_equal_results_are_equal_files(tmp_path: Path) -> None:
+def test_equal_results_give_identical_files(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     first, second = write(tmp_path / "a", make_result()), write(tmp_path / "b", make_result())
@@ -284,7 +284,7 @@ def test_equal_results_are_equal_files(tmp_path: Path) -> None:
         assert first[name].read_bytes() == second[name].read_bytes()
 
 
-def test_a_failed_write_keeps_the_old_file_and_no_partial_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_write_keeps_the_old_file_and_no_partial_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files = write(tmp_path, make_result())
     before = files["shapes.npz"].read_bytes()
 
@@ -317,7 +317,7 @@ def test_normals_have_unit_length_and_point_out_of_the_face() -> None:
     np.testing.assert_allclose(np.linalg.norm(bent, axis=1), 1, rtol=1e-6)
 
 
-def test_viewers_get_a_size_between_one_and_ten() -> None:
+def test_viewer_scale_gives_a_size_between_one_and_ten() -> None:
     for size in (1e-3, 0.5, 1.0, 30.0, 4e4):
         shapes = np.array([[[0.0, 0, 0], [size, 0, 0]]])
         assert 1 <= size * viewer_scale(shapes) < 10 * (1 + 1e-9)

@@ -74,7 +74,7 @@ def test_a_cancel_is_noticed_within_a_quarter_of_a_second(jobs: Jobs, attempt: A
     assert jobs.get(attempt.id).status is Status.CANCELLED
 
 
-def test_it_stops_at_its_time_limit_whatever_the_record(attempt: Attempt, now: list[float]) -> None:
+def test_an_attempt_stops_at_its_time_limit(attempt: Attempt, now: list[float]) -> None:
     assert not attempt.should_stop()
     now[0] = 9.0
     assert attempt.should_stop()
@@ -83,7 +83,7 @@ def test_it_stops_at_its_time_limit_whatever_the_record(attempt: Attempt, now: l
 def test_a_finished_job_waits_for_an_unavailable_blob_store(
     jobs: Jobs, attempt: Attempt, now: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An outage of seconds discarded the result of hours."""
+    """An outage of seconds used to discard the result of hours."""
     (tmp_path / "report.json").write_text("{}")
     artifact = Artifact(name="report.json", media_type="application/json", bytes=2, sha256="0" * 64, description="")
     finished = Finished(metrics={}, outcome="converged", sentence="Done.", warnings=(), artifacts=(artifact,))
@@ -111,7 +111,7 @@ def test_a_finished_job_waits_for_an_unavailable_blob_store(
         attempt.store(finished, tmp_path)
 
 
-def test_the_log_is_complete_though_the_store_was_away_at_the_end(
+def test_the_log_is_complete_despite_an_outage_at_the_end(
     jobs: Jobs, attempt: Attempt, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     append, away = jobs.records.append_log, [2]
@@ -131,7 +131,7 @@ def test_the_log_is_complete_though_the_store_was_away_at_the_end(
     assert [line.split(" ", 1)[1] for line in jobs.log(attempt.id).splitlines()] == ["Begun.", "Failed: why."]
 
 
-def test_a_log_that_cannot_be_written_does_not_withhold_the_outcome(
+def test_the_outcome_is_recorded_even_if_the_log_cannot_be_written(
     jobs: Jobs, attempt: Attempt, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def never(id: str, lines: Sequence[str]) -> None:
@@ -144,7 +144,7 @@ def test_a_log_that_cannot_be_written_does_not_withhold_the_outcome(
     assert jobs.get(attempt.id).status is Status.FAILED
 
 
-def test_a_line_that_is_logged_during_a_write_is_written_once(
+def test_a_line_logged_during_a_write_is_written_once(
     jobs: Jobs, attempt: Attempt, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     append, logging = jobs.records.append_log, threading.Thread(target=attempt.log, args=("Second.",))
@@ -164,7 +164,7 @@ def test_a_line_that_is_logged_during_a_write_is_written_once(
 
 
 def test_a_new_stage_is_reported_at_once(jobs: Jobs, attempt: Attempt, now: list[float]) -> None:
-    """A job that waits for its blob store tells nothing more: its record must not stay at the stage before."""
+    """A job that waits for its blob store reports no more: its record must not stay at the previous stage."""
     for stage in ("reweight", "finish", "exporting"):
         now[0] += 0.01
         attempt.report(Progress(stage=stage, fraction=0.5, updated_at=datetime.now(UTC)))
@@ -207,7 +207,7 @@ def test_progress_is_repeated_while_files_are_fetched_and_stored(
     assert {(each.fraction, each.seconds_left) for each in during["put"]} == {(1.0, 0.0)}
 
 
-def test_a_job_runs_although_the_reply_to_its_claim_is_lost(
+def test_a_job_runs_even_if_the_reply_to_its_claim_is_lost(
     jobs: Jobs, tmp_path: Path, interpretation: Interpretation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "inputs.npz"

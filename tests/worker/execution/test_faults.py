@@ -32,7 +32,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="finds processes
 def house(
     valkey_data: Path, tmp_path_factory: pytest.TempPathFactory, inputs_files: tuple[Path, Path]
 ) -> Iterator[House]:
-    """Two workers that notice things soon."""
+    """Two workers with short timeouts."""
     settings = Settings(
         data=tmp_path_factory.mktemp("house"), redis_url=Settings(data=valkey_data).redis,
         queue=f"faults-{secrets.token_hex(3)}", workers=2, threads=1, lost_after=2.0, cancel_grace=3.0, stop_grace=1.0,
@@ -41,7 +41,7 @@ def house(
         yield house
 
 
-def test_the_queue_gives_the_same_bits_as_a_plain_call(house: House, tmp_path: Path) -> None:
+def test_a_queued_job_gives_the_same_bits_as_a_direct_call(house: House, tmp_path: Path) -> None:
     id = house.submit(name="same bits")
     job = house.final(id)
     assert (job.status, job.error, job.attempt) == (Status.SUCCEEDED, None, 1)
@@ -63,7 +63,7 @@ def test_the_queue_gives_the_same_bits_as_a_plain_call(house: House, tmp_path: P
 
 
 @pytest.mark.slow
-def test_progress_contains_numbers(house: House) -> None:
+def test_progress_reports_fraction_objective_and_residual(house: House) -> None:
     id = house.submit(long=True)
     house.until(lambda: (house.jobs.get(id).progress or SHORT) and house.solving(id).progress.reweighting, "reweights")  # type: ignore[union-attr]
     progress = house.jobs.get(id).progress
@@ -167,7 +167,7 @@ def test_a_stopping_worker_requeues_its_job(house: House) -> None:
     house.solving(id)
     (job_process,) = house.job_processes()
     (worker,) = [pid for pid in house.worker_pids() if job_process in children(pid)]
-    os.kill(job_process, signal.SIGTERM)  # as service managers do, which tell every process
+    os.kill(job_process, signal.SIGTERM)  # as service managers do, which signal every process
     os.kill(worker, signal.SIGTERM)
     house.until(lambda: house.jobs.get(id).attempt == 2, "it begins again")
     assert "worker_lost" not in str([event.data for event in house.jobs.events(id)])
@@ -235,7 +235,7 @@ def test_a_job_missing_from_the_queue_is_completed(house: House) -> None:
 
 
 @pytest.mark.slow
-def test_lost_inputs_are_an_internal_error_whose_trace_is_in_the_log(house: House) -> None:
+def test_lost_inputs_are_an_internal_error_with_a_traceback_in_the_log(house: House) -> None:
     first, second = house.submit(long=True), house.submit(long=True)
     house.solving(first)
     house.solving(second)
@@ -258,7 +258,7 @@ def test_lost_inputs_are_an_internal_error_whose_trace_is_in_the_log(house: Hous
 
 
 @pytest.mark.slow
-def test_a_job_beyond_its_time_limit_reports_it(house: House, tmp_path: Path) -> None:
+def test_a_job_over_its_time_limit_fails_as_timed_out(house: House, tmp_path: Path) -> None:
     settings = dataclasses.replace(
         house.settings, data=tmp_path, queue=f"late-{secrets.token_hex(3)}", workers=1, time_limit=1.5, memory_limit=0
     )
@@ -274,7 +274,7 @@ def test_a_job_beyond_its_time_limit_reports_it(house: House, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_a_job_out_of_memory_reports_it(house: House, tmp_path: Path) -> None:
+def test_a_job_over_its_memory_limit_fails_as_out_of_memory(house: House, tmp_path: Path) -> None:
     make_inputs(tmp_path / "big.npz", frames=200, points=6000)
     settings = dataclasses.replace(
         house.settings, data=tmp_path, queue=f"lean-{secrets.token_hex(3)}", workers=1, memory_limit=640 << 20
@@ -300,7 +300,7 @@ def test_invalid_arguments_and_settings_are_reported() -> None:
     assert "PLIANT_WORKERS: expected a whole number" in unset.stderr
 
 
-def test_fsck_is_a_command(house: House) -> None:
+def test_the_fsck_command_reports_inconsistencies(house: House) -> None:
     command = [sys.executable, "-m", "pliant.worker", "fsck"]
     env = {**os.environ, **house.settings.to_environment()}
     clean = subprocess.run(command, capture_output=True, text=True, check=False, env=env)

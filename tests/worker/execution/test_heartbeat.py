@@ -24,7 +24,7 @@ pytestmark = [
 ]
 
 LEASE = 2
-"""Seconds until RQ gives up an entry without a heartbeat; 90 where nothing shortens it."""
+"""Seconds until RQ abandons an entry without a heartbeat; 90 by default."""
 
 WORKER = f"""
 import sys
@@ -39,18 +39,18 @@ sys.exit(main.main(["work"]))
 def test_a_job_longer_than_rqs_lease_is_not_abandoned(
     settings: Settings, inputs_files: tuple[Path, Path], caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Before there was a heartbeat every job of more than 90 s ended with `AbandonedJobError`, although it succeeded."""
+    """Without a heartbeat, RQ ended every job of more than 90 s with `AbandonedJobError`, although it succeeded."""
     assert registered(settings, inputs_files, beat_every=1) == (1, 0)
     assert [record for record in caplog.records if record.levelno >= logging.ERROR] == []
 
 
-def test_without_a_heartbeat_it_would_be(settings: Settings, inputs_files: tuple[Path, Path]) -> None:
-    """The test above can fail: the same job with a heartbeat that comes too late is declared abandoned."""
+def test_without_a_heartbeat_a_long_job_is_abandoned(settings: Settings, inputs_files: tuple[Path, Path]) -> None:
+    """Control for the test above: the same job is declared abandoned if its heartbeat comes too late."""
     assert registered(settings, inputs_files, beat_every=60) == (0, 1)
 
 
 def registered(settings: Settings, inputs: tuple[Path, Path], *, beat_every: int) -> tuple[int, int]:
-    """Run a long job past RQ's lease, with RQ's clean-up under way; return its entries as started and as failed."""
+    """Run a long job past RQ's lease, with RQ's clean-up under way; return the numbers of its started and failed entries."""
     house = House(settings, inputs=inputs, children=[])
     raw = connect(settings.redis, decode=False)
     queue = RqQueue(settings.queue, connection=raw, serializer=JSONSerializer)

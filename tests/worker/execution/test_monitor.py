@@ -32,7 +32,7 @@ KILLED = int(signal.SIGKILL)
 
 @pytest.fixture
 def running(jobs: Jobs, inputs_file: Path, interpretation: Interpretation) -> Callable[..., Watch]:
-    """A claimed job under watch, with settings and a clock of the test's own."""
+    """A claimed job under supervision, with settings and a clock set by the test."""
 
     def make(time: list[float] | None = None, options: Options | None = None, **settings: object) -> Watch:
         id = jobs.submit(inputs_file, Submission(options=options or Options()), interpretation=interpretation).id
@@ -72,7 +72,7 @@ def test_an_attempt_that_ignores_its_time_limit_is_killed(running: Callable[...,
     assert (after.job.error.code, "10 s" in after.job.error.detail) == ("timed_out", True)
 
 
-def test_a_jobs_own_time_limit_is_enforced_too(running: Callable[..., Watch]) -> None:
+def test_the_time_limit_option_of_a_job_is_enforced(running: Callable[..., Watch]) -> None:
     time = [0.0]
     watch = running(time, options=Options(time_limit=4.0), time_limit=100.0)
     time[0] = 6.9
@@ -85,7 +85,7 @@ def test_a_jobs_own_time_limit_is_enforced_too(running: Callable[..., Watch]) ->
     assert (after.job.error.code, "option time_limit of 4 s" in after.job.error.detail) == ("timed_out", True)
 
 
-def test_without_a_limit_there_is_none(running: Callable[..., Watch]) -> None:
+def test_a_time_limit_of_zero_means_no_limit(running: Callable[..., Watch]) -> None:
     time = [0.0]
     watch = running(time, time_limit=0.0)
     time[0] = 1e9
@@ -127,7 +127,7 @@ def test_an_attempt_that_lost_its_job_is_killed_at_once(jobs: Jobs, running: Cal
     assert finalize(watch, status=KILLED, peak=0, patience=Patience(0)) is None
 
 
-def test_supervision_continues_while_the_store_is_away(
+def test_supervision_continues_while_the_store_is_unavailable(
     running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     time = [0.0]
@@ -144,7 +144,7 @@ def test_supervision_continues_while_the_store_is_away(
         finalize(watch, status=KILLED, peak=0, patience=Patience(0))
 
 
-def test_a_crash_is_distinguished_from_lack_of_memory(
+def test_crashes_and_out_of_memory_kills_are_distinguished(
     jobs: Jobs, running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def code(watch: Watch, status: int, peak: int = 0) -> str:
@@ -168,7 +168,7 @@ def test_a_crash_is_distinguished_from_lack_of_memory(
     )
 
 
-def test_kernel_counters_are_whole_numbers_that_do_not_fall() -> None:
+def test_oom_kill_counters_never_decrease() -> None:
     before = OomKills.now()
     after = OomKills.now()
     assert 0 <= before.machine <= after.machine
@@ -177,7 +177,7 @@ def test_kernel_counters_are_whole_numbers_that_do_not_fall() -> None:
     assert not OomKills(1, 1).since(OomKills(1, 1))
 
 
-def test_patience_repeats_until_the_store_answers(jobs: Jobs, running: Callable[..., Watch]) -> None:
+def test_calls_are_retried_until_the_store_answers(jobs: Jobs, running: Callable[..., Watch]) -> None:
     watch = running()
     answers = [StoreUnavailable("x", reason="y"), None]
 
@@ -202,7 +202,7 @@ def test_patience_repeats_until_the_store_answers(jobs: Jobs, running: Callable[
         (OSError("no number"), "internal_error", 500, False),
     ],
 )  # fmt: skip
-def test_every_error_becomes_a_sentence(error: BaseException, code: str, status: int, retryable: bool) -> None:
+def test_every_error_becomes_a_clean_problem(error: BaseException, code: str, status: int, retryable: bool) -> None:
     problem = problem_of(error)
     assert (problem.code, problem.status, problem.retryable) == (code, status, retryable)
     assert problem.detail.endswith(".")
@@ -211,14 +211,14 @@ def test_every_error_becomes_a_sentence(error: BaseException, code: str, status:
         assert (problem.field, problem.expected, problem.got, problem.hint) == ("tracks", "a", "b", "Do c")
 
 
-def test_a_thread_that_cannot_start_is_out_of_memory_only_under_a_limit() -> None:
+def test_a_thread_start_failure_is_out_of_memory_only_under_a_limit() -> None:
     error = RuntimeError("can't start new thread")
     assert problem_of(error, memory_limit=2**30).code == "out_of_memory"
     assert "1.0 GiB" in problem_of(error, memory_limit=2**30).detail
     assert problem_of(error).code == "internal_error"
 
 
-def test_limits_are_stated_in_messages() -> None:
+def test_failure_messages_state_the_limit_signal_or_exit_code() -> None:
     assert "2.0 GiB" in out_of_memory(2**31).detail
     assert "the machine has" in out_of_memory().detail
     assert "1.5 s" in timed_out(1.5).detail
@@ -228,7 +228,7 @@ def test_limits_are_stated_in_messages() -> None:
     assert isinstance(out_of_memory(), Problem)
 
 
-def test_progress_never_falls_and_estimates_what_is_left() -> None:
+def test_progress_never_decreases_and_estimates_the_time_left() -> None:
     reports = []
     time = [100.0]
     reporter = Reporter(reports.append, clock=lambda: time[0])
@@ -259,12 +259,12 @@ def test_progress_never_falls_and_estimates_what_is_left() -> None:
     assert all(before[1] == after[0] for before, after in itertools.pairwise(edges))
 
 
-def test_stated_seconds_decide_fraction_and_time_left() -> None:
+def test_the_solvers_time_estimate_determines_fraction_and_time_left() -> None:
     told: list[Progress] = []
     time = [0.0]
     reporter = Reporter(told.append, clock=lambda: time[0], export_seconds=2.0)
     time[0] = 5.0
-    reporter.part("solving", 0.9, stage="cameras", seconds_left=13.0)  # the first report begins the clock
+    reporter.part("solving", 0.9, stage="cameras", seconds_left=13.0)  # the first report starts the clock
     time[0] = 10.0
     reporter.part("solving", 0.9, stage="reweight", seconds_left=3.0)
     assert (told[-1].seconds_left, told[-1].fraction) == (5.0, pytest.approx(5 / 10))
@@ -279,7 +279,7 @@ def test_stated_seconds_decide_fraction_and_time_left() -> None:
     assert (told[-1].seconds_left, told[-1].fraction) == (0.0, 1.0)
 
 
-def test_a_film_is_tracked_and_then_solved_for_as_long_as_planned() -> None:
+def test_film_progress_includes_the_planned_solving_time() -> None:
     told: list[Progress] = []
     time = [0.0]
     reporter = Reporter(told.append, clock=lambda: time[0], shares=FILM_SHARES)
@@ -295,7 +295,7 @@ def test_a_film_is_tracked_and_then_solved_for_as_long_as_planned() -> None:
     assert told[-1].seconds_left == 17.0, "then the solver knows better"
 
 
-def test_silence_is_filled_with_the_seconds_counted_down() -> None:
+def test_time_left_counts_down_between_reports() -> None:
     told: list[Progress] = []
     time = [0.0]
     reporter = Reporter(told.append, clock=lambda: time[0])
@@ -316,7 +316,7 @@ def test_silence_is_filled_with_the_seconds_counted_down() -> None:
     assert [(each.fraction, each.seconds_left) for each in told[-2:]] == [(1.0, 0.0)] * 2, "while results are stored"
 
 
-def test_ticks_come_from_a_thread_while_a_part_is_silent() -> None:
+def test_a_background_thread_ticks_between_reports() -> None:
     ticked = threading.Event()
     told: list[Progress] = []
 

@@ -6,7 +6,7 @@ from pliant.worker.execution import pace
 from pliant.worker.execution.pace import PIECE_SECONDS, PIECES, MachinePace
 
 
-def test_the_pace_is_the_measured_time_over_the_planned_one_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_pace_is_the_mean_ratio_of_measured_to_planned_time(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter(np.array([0, 2, 10, 14]) * PIECES * PIECE_SECONDS)
     monkeypatch.setattr(pace.time, "thread_time", lambda: float(next(clock)))
     machine = MachinePace()
@@ -14,5 +14,5 @@ def test_the_pace_is_the_measured_time_over_the_planned_one_averaged(monkeypatch
     assert machine.measure() == pytest.approx((2 + 4) / 2)
 
 
-def test_a_machine_has_a_pace() -> None:
+def test_this_machine_has_a_plausible_pace() -> None:
     assert 0.02 < MachinePace().measure() < 200

@@ -21,7 +21,7 @@ from pliant.worker.formats import Inputs
 from worker_house import make_inputs
 
 CHEAP = Options(prior="smooth", max_reweightings=1, refine_rotations=False, surface="free", camera="orthographic")
-"""The default prior takes longer to learn than everything that is asked with this one."""
+"""Without the default prior, which takes longer to learn than all the solves of these tests."""
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     return make_inputs(tmp_path_factory.mktemp("run") / "inputs.npz", frames=8, points=60)
 
 
-def test_the_files_hold_what_the_call_returns(inputs: Inputs, tmp_path: Path) -> None:
+def test_the_files_match_the_returned_results(inputs: Inputs, tmp_path: Path) -> None:
     steps: list[Progress] = []
     finished = reconstruct(inputs, Options(max_reweightings=4), tmp_path / "new", on_progress=steps.append)
     report = json.loads((tmp_path / "new" / "report.json").read_text())
@@ -55,7 +55,7 @@ def test_the_files_hold_what_the_call_returns(inputs: Inputs, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("stage", ["loading", "cameras", "initialise", "reweight", "exporting"])
-def test_it_stops_at_every_stage(inputs: Inputs, tmp_path: Path, stage: str) -> None:
+def test_a_reconstruction_can_be_stopped_at_every_stage(inputs: Inputs, tmp_path: Path, stage: str) -> None:
     steps: list[Progress] = []
     with pytest.raises(Interrupted, match="stopped on request"):
         reconstruct(
@@ -70,7 +70,7 @@ def test_it_stops_at_every_stage(inputs: Inputs, tmp_path: Path, stage: str) -> 
     assert not list(tmp_path.glob(".*")), "no half-written file"
 
 
-def test_a_job_keeps_to_its_own_time_limit(inputs: Inputs, tmp_path: Path) -> None:
+def test_the_time_limit_option_ends_a_reconstruction(inputs: Inputs, tmp_path: Path) -> None:
     with pytest.raises(TimedOut, match=r"option time_limit of 0\.001 s") as caught:
         reconstruct(inputs, Options(time_limit=0.001), tmp_path)
     problem = problem_of(caught.value)
@@ -78,7 +78,7 @@ def test_a_job_keeps_to_its_own_time_limit(inputs: Inputs, tmp_path: Path) -> No
     assert reconstruct(inputs, CHEAP.model_copy(update={"time_limit": 100.0}), tmp_path).outcome == "max_reweightings"
 
 
-def test_every_option_of_the_solver_reaches_it() -> None:
+def test_every_solver_option_reaches_the_solver_settings() -> None:
     chosen = {
         "method": "spatio_temporal", "camera": "perspective", "surface": "free", "basis_size": 2, "refine_rotations": False,
         "preset": "paper",
@@ -104,7 +104,7 @@ def test_contradictory_inputs_are_rejected_before_a_file_is_written(inputs: Inpu
 
 
 def test_the_long_job_of_the_fault_tests_is_long_by_construction() -> None:
-    """Every reweighting takes as many inner iterations as may be, and its energy falls: a thousand of them on any machine."""
+    """Every reweighting uses all inner iterations and lowers the energy, so all 1000 of them run on any machine."""
     sequence, options = long_sequence(), dict(LONG, max_reweightings=3)
     solved = solve(sequence.tracks, cameras=KnownCamera(sequence.rotations), settings=Settings(**options))
     assert solved.outcome is Outcome.MAX_REWEIGHTINGS

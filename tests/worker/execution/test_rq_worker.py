@@ -1,4 +1,4 @@
-"""The RQ worker beside its job process: what it writes during a job does not delay supervision."""
+"""The RQ worker during a job: its own writes do not delay supervision."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pliant.worker.store.redis import RedisRecords
 from rq.serializers import JSONSerializer
 
 PAUSE = 3.0
-"""Seconds that the server gives no answer."""
+"""Seconds during which the server does not answer."""
 
 
 def test_heartbeats_do_not_delay_supervision_while_the_server_hangs(settings: Settings) -> None:

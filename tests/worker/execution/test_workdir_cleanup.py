@@ -20,7 +20,7 @@ from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 
 
-def test_all_calls_share_one_time_limit() -> None:
+def test_all_retried_calls_share_one_time_limit() -> None:
     asked: list[str] = []
 
     def gone() -> None:
@@ -68,12 +68,12 @@ def test_scratch_files_are_removed_once_the_store_confirms_their_owner(
 
     def stammering(wanted: str) -> Stored:
         looks.append(wanted)
-        if len(looks) > 1 and (away == "it stays away" or len(looks) < 4):  # the first is the last word's
+        if len(looks) > 1 and (away == "it stays away" or len(looks) < 4):  # the first read is finalize's
             raise StoreUnavailable("The store", reason="gone")
         return get(wanted)
 
     monkeypatch.setattr(jobs.records, "get", stammering)
-    worker._stop_by = 0.0  # being stopped, it has two seconds
+    worker._stop_by = 0.0  # a stopping worker has two seconds
     worker._reap(watch, delivery, status=9, peak=0)  # type: ignore[arg-type]
     connection.close()
     assert len(looks) >= 4

@@ -97,7 +97,7 @@ def test_too_many_members_and_unknown_compression_are_rejected(tmp_path: Path) -
         assert caught.value.code == code
 
 
-def test_a_member_whose_checksum_is_wrong_is_refused(tmp_path: Path) -> None:
+def test_a_member_with_a_wrong_checksum_is_refused(tmp_path: Path) -> None:
     path = archive(tmp_path / "x.npz", [("tracks.npy", GOOD)], zipfile.ZIP_STORED)
     content = bytearray(path.read_bytes())
     content[200] ^= 1
@@ -117,7 +117,7 @@ def test_arbitrary_bytes_only_raise_input_errors(junk: bytes, at: int) -> None:
         assert error.code in ("damaged_file", "wrong_type", "too_large", "object_array")  # noqa: PT017
 
 
-def test_a_directory_that_points_before_the_file_is_refused(tmp_path: Path) -> None:
+def test_a_zip_directory_pointing_before_the_file_is_refused(tmp_path: Path) -> None:
     path = archive(tmp_path / "x.npz", [("tracks.npy", GOOD)])
     path.write_bytes(path.read_bytes()[1:])
     with pytest.raises(InvalidInput) as caught:

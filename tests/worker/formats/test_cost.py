@@ -10,7 +10,7 @@ from pliant.worker.formats.cost import BEYOND, BYTES, LIBRARIES, estimated, larg
 
 @pytest.mark.parametrize("prior", ["gaussian", "smooth", "smooth+low_rank"])
 @pytest.mark.parametrize("points", [1_000, 100_000, 1_000_000])
-def test_what_fits_is_what_is_estimated(prior: str, points: int) -> None:
+def test_the_largest_job_that_fits_agrees_with_the_estimate(prior: str, points: int) -> None:
     options = Options(prior=prior)
     memory = estimated(50, points, options).memory_bytes
     most_points, most_frames = largest_that_fits(memory, 50, points, options)
@@ -19,7 +19,7 @@ def test_what_fits_is_what_is_estimated(prior: str, points: int) -> None:
     assert largest_that_fits(memory - 50 * BYTES[prior], 50, points, options)[0] < points
 
 
-def test_further_observations_of_large_jobs_take_less_memory() -> None:
+def test_large_jobs_need_less_memory_per_additional_observation() -> None:
     large = estimated(100, 1_000_000, Options()).memory_bytes
     assert large == LIBRARIES + BYTES["gaussian"] * BLOCK_OBSERVATIONS + BEYOND * (100_000_000 - BLOCK_OBSERVATIONS)
     assert estimated(100, 1_000_000, Options(prior="smooth+low_rank")).memory_bytes > large

@@ -1,4 +1,4 @@
-"""Files of `pliant track`: what they hold besides tracks is used."""
+"""Files of `pliant track`: the arrays beside the tracks are used too."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def film_file(path: Path, **changed: object) -> Path:
     return path
 
 
-def test_all_that_the_tracker_found_is_used(tmp_path: Path) -> None:
+def test_every_array_of_the_tracker_is_used(tmp_path: Path) -> None:
     given = film_arrays()
     inputs = read_inputs(tracks=film_file(tmp_path / "tracks.npz"), options=Options())
     np.testing.assert_array_equal(inputs.tracks.points[given["visibility"]], given["tracks"][given["visibility"]])
@@ -64,7 +64,7 @@ def test_all_that_the_tracker_found_is_used(tmp_path: Path) -> None:
     assert back.texture == inputs.texture or back.texture.jpeg == inputs.texture.jpeg  # type: ignore[union-attr]
 
 
-def test_options_and_a_mesh_overrule_the_file(tmp_path: Path) -> None:
+def test_options_and_a_given_mesh_override_the_file(tmp_path: Path) -> None:
     file = film_file(tmp_path / "tracks.npz")
     inputs = read_inputs(tracks=file, mesh="none", options=Options(frames="::2", y_axis="up"))
     assert inputs.mesh is None
@@ -82,7 +82,7 @@ def plain_file(folder: Path) -> Path:
     return folder / "plain.npz"
 
 
-def test_a_film_job_reads_the_same(tmp_path: Path) -> None:
+def test_a_film_job_reads_the_file_as_a_tracks_job_does(tmp_path: Path) -> None:
     file = film_file(tmp_path / "tracks.npz")
     alone = read_inputs(tracks=file, options=Options(stride=2))
     job = read_tracked(file, Tracked(container="mp4", warnings=()), Options(stride=2))
@@ -113,7 +113,7 @@ def test_a_film_job_reads_the_same(tmp_path: Path) -> None:
         ({"template_image": np.zeros((4, 4), np.uint8)}, "template_image"),
     ],
 )
-def test_what_does_not_fit_together_is_refused(tmp_path: Path, changed: dict[str, np.ndarray], got: str) -> None:
+def test_inconsistent_arrays_are_refused(tmp_path: Path, changed: dict[str, np.ndarray], got: str) -> None:
     with pytest.raises(InvalidInput, match=got) as refused:
         read_inputs(tracks=film_file(tmp_path / "tracks.npz", **changed), options=Options())
     assert refused.value.code == "damaged_file"

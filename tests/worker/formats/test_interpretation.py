@@ -60,7 +60,7 @@ def test_signed_fractions_are_detected_with_a_known_size(tmp_path: Path) -> None
     assert alone.interpretation.y_axis == "up"
 
 
-def test_points_outside_the_picture_do_not_hide_fractions(tmp_path: Path) -> None:
+def test_fractions_are_detected_despite_points_outside_the_picture(tmp_path: Path) -> None:
     some = UNIT.copy()
     some[-1, :3] = [1.25, -0.5]
     assert read(tmp_path, {"tracks": some}, image_size="9x5").interpretation.coordinates == "unit"
@@ -84,7 +84,7 @@ def test_a_contradicted_layout_is_ambiguous(tmp_path: Path) -> None:
     assert "one.W and two.W" in two.got
 
 
-def test_a_long_list_of_pixels_is_not_a_long_video() -> None:
+def test_a_long_list_of_pixels_is_not_read_as_many_frames() -> None:
     y, x = np.mgrid[:80, :160].astype(float)
     first = np.stack([x, y], axis=-1).reshape(1, -1, 2)
     quick = first + 30.0 * np.arange(4)[:, None, None] ** 1.5  # neighbours in the list are closer than frames
@@ -98,7 +98,7 @@ def test_the_option_y_axis_is_used(tmp_path: Path) -> None:
     assert "y points up, as set by y_axis." in up.notes
 
 
-def test_numbers_above_1_are_a_mask_or_logits(tmp_path: Path) -> None:
+def test_visibility_above_1_may_be_a_mask_or_logits(tmp_path: Path) -> None:
     positive = np.where(SEEN, 3.0, 0.5)
     error = refused("out_of_range", {"tracks": POINTS, "visibility": positive})
     assert offered(error) == [{"visibility": "bool"}, {"visibility": "logits"}]
@@ -110,7 +110,7 @@ def test_numbers_above_1_are_a_mask_or_logits(tmp_path: Path) -> None:
     refused("out_of_range", {"tracks": POINTS, "visibility": positive}, visibility="probability")
 
 
-def test_visibility_of_rows_goes_with_a_matrix(tmp_path: Path) -> None:
+def test_a_matrix_may_have_visibility_for_each_coordinate_row(tmp_path: Path) -> None:
     twice = np.repeat(SEEN, 2, axis=0)
     np.testing.assert_array_equal(read(tmp_path, {"W": MATRIX, "mask": twice}).tracks.visible > 0, SEEN)
     stacked = np.vstack([POINTS[..., 0], POINTS[..., 1]])
@@ -118,14 +118,14 @@ def test_visibility_of_rows_goes_with_a_matrix(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(tmp_path, {"W": stacked, "mask": half}).tracks.visible > 0, SEEN)
 
 
-def test_more_axes_than_are_known_are_refused() -> None:
+def test_unknown_axes_and_batches_are_refused() -> None:
     refused("wrong_shape", {"tracks": np.zeros((1, 1, 2, 3, 4, 2))})
     assert "a batch of 2" in refused("wrong_shape", {"pred_tracks": np.stack([POINTS, POINTS])}).got
     assert "a batch of 2" in refused("wrong_shape", {"tracks": np.stack([pixels(POINTS)] * 2)}).got
     refused("wrong_shape", {"tracks": np.zeros((4, 2, 1, 9))})
 
 
-def test_points_in_space_need_intrinsics(tmp_path: Path) -> None:
+def test_three_dimensional_points_need_intrinsics(tmp_path: Path) -> None:
     assert refused("missing_array", {"tracks_xyz": WORLD}).field == "tracks.intrinsics"
     for bad in (np.ones(3), np.array([0.0, 1, 2, 3]), np.array([1, 1, np.nan, 1]), np.array(["8", "8", "4", "2"])):
         refused("wrong_shape", {"tracks_xyz": WORLD, "intrinsics": bad})
@@ -185,7 +185,7 @@ def test_rotations_are_read_in_the_layout_that_makes_them_orthonormal() -> None:
     assert as_rotations(odd, F) is odd
 
 
-def test_matlab_struct_arrays_hold_a_frame_each(tmp_path: Path) -> None:
+def test_matlab_struct_arrays_hold_one_frame_per_element(tmp_path: Path) -> None:
     frames = np.zeros((1, F), dtype=[("W", object), ("name", object)])
     for index in range(F):
         frames[0, index] = (POINTS[index].T, "made")
@@ -194,7 +194,7 @@ def test_matlab_struct_arrays_hold_a_frame_each(tmp_path: Path) -> None:
     np.testing.assert_array_equal(got.tracks.points, POINTS)
 
 
-def test_matlab_73_text_and_empty_arrays_are_no_tracks_and_cells_have_a_limit(tmp_path: Path) -> None:
+def test_matlab_73_ignores_text_and_empty_arrays_and_limits_cells(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "t.mat", "w") as file:
         file["W"] = MATRIX.T
         file["text"] = np.zeros((4, 1), dtype=np.uint16)
@@ -211,7 +211,7 @@ def test_matlab_73_text_and_empty_arrays_are_no_tracks_and_cells_have_a_limit(tm
         read_matlab73(stream, field="tracks", limits=Limits())
 
 
-def test_tracks_of_all_pixels_give_their_grid(tmp_path: Path) -> None:
+def test_tracks_of_all_pixels_give_a_grid_mesh(tmp_path: Path) -> None:
     np.savez(tmp_path / "t.npz", tracks=pixels(POINTS), visibility=pixels(SEEN))
     got = read_inputs(tracks=tmp_path / "t.npz", options=Options())
     assert got.interpretation.mesh_source == "grid"

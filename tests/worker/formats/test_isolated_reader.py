@@ -26,7 +26,7 @@ def all_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(isolated_reader, "LARGE", 0)
 
 
-def test_the_stored_file_and_the_interpretation_are_the_same(all_apart: None, tmp_path: Path) -> None:
+def test_isolated_reading_gives_the_same_file_and_interpretation(all_apart: None, tmp_path: Path) -> None:
     np.savez(tmp_path / "t.npz", tracks=POINTS)
     np.savez(tmp_path / "g.npz", shapes=moving_sheet(8, 6, 7))
     options = Options(stride=2)
@@ -45,7 +45,7 @@ def test_the_stored_file_and_the_interpretation_are_the_same(all_apart: None, tm
     assert sorted(path.name for path in tmp_path.iterdir()) == ["g.npz", "here.npz", "t.npz", "there.npz"]
 
 
-def test_both_readers_accept_the_same() -> None:
+def test_both_readers_accept_the_same_parameters() -> None:
     here, apart_too = (dict(inspect.signature(door).parameters) for door in (read_inputs, store_inputs))
     assert apart_too.pop("target").default is inspect.Parameter.empty
     assert here == apart_too
@@ -91,7 +91,7 @@ def test_isolated_reading_keeps_no_memory_in_the_parent(tmp_path: Path) -> None:
 
 
 def peak_now() -> int:
-    """Resident bytes: the peak, once it is forgotten."""
+    """Resident bytes now, read as the peak right after a reset."""
     forget_peak(os.getpid())
     return peak_of(os.getpid())
 

@@ -27,12 +27,12 @@ for name, parser in PARSERS.items():
 NEEDED = {"matlab5": {"scipy.io"}, "matlab73": {"h5py"}, "ply": {"plyfile"}, "obj": {"plyfile"}, "png": {"PIL"}}
 HEAVY = {"scipy.io", "scipy.linalg", "scipy.sparse", "h5py", "PIL", "pydantic", "pliant.solver.reconstruct"}
 ALSO = {"matlab5": {"scipy.sparse", "scipy.linalg"}}
-"""What comes with what is needed."""
+"""Modules that the needed ones import."""
 
 
 @pytest.fixture(scope="module")
 def modules() -> dict[str, set[str]]:
-    """What a sandbox has loaded, for each parser."""
+    """The modules that a sandbox has loaded, for each parser."""
     ran = subprocess.run([sys.executable, "-I", "-c", LISTED], capture_output=True, text=True, check=True)
     return {name: set(loaded) for name, *loaded in map(str.split, ran.stdout.splitlines())}
 
@@ -54,13 +54,13 @@ def test_a_sandbox_loads_only_its_parser(modules: dict[str, set[str]], parser: s
     ],
     ids=["reader", "film", "service"],
 )
-def test_what_solves_nothing_loads_neither_scipy_nor_the_tracker(code: str) -> None:
+def test_reader_film_process_and_service_load_neither_scipy_nor_tracker(code: str) -> None:
     listed = f"import sys; {code}; print(*sys.modules)"
     ran = subprocess.run([sys.executable, "-I", "-c", listed], capture_output=True, text=True, check=True)
     assert not {"scipy", "pliant.tracking.track", "pliant.solver.reconstruct"} & set(ran.stdout.split())
 
 
-def test_the_film_process_checks_nothing_that_needs_pydantic() -> None:
+def test_the_film_process_does_not_load_pydantic() -> None:
     listed = "import sys, pliant.worker.films.contained_process, pliant.tracking as t; t.open_film; print(*sys.modules)"
     ran = subprocess.run([sys.executable, "-I", "-c", listed], capture_output=True, text=True, check=True)
     loaded = set(ran.stdout.split())

@@ -27,7 +27,7 @@ def sheet() -> np.ndarray:
 
 
 def parse_here(parser: str, path: Path, *, field: str, limits: Limits) -> Arrays:
-    """The same parser without the half second that a child process takes to start."""
+    """Call the parser in this process, to save the half second that a child takes to start."""
     with path.open("rb") as stream:
         return PARSERS[parser](stream, field=field, limits=limits)
 
@@ -81,7 +81,7 @@ def test_faces_are_read_unchanged_from_every_format(tmp_path: Path, tracks: Path
         assert got.interpretation.num_faces == len(faces)
 
 
-def test_relative_obj_indices_count_back(tmp_path: Path, tracks: Path) -> None:
+def test_negative_obj_indices_count_from_the_end(tmp_path: Path, tracks: Path) -> None:
     (tmp_path / "m.obj").write_text(obj(np.zeros((0, 3), dtype=int)) + "f -3 -2 -1\nf 1 2 3\n")
     got = read(tracks, tmp_path / "m.obj")
     assert got.mesh is not None
@@ -114,7 +114,7 @@ def test_no_mesh_is_generated_for_none(tracks: Path) -> None:
     assert got.interpretation.mesh_source == "none"
 
 
-def test_a_mesh_of_other_points_is_refused(tmp_path: Path, tracks: Path) -> None:
+def test_a_mesh_with_another_number_of_points_is_refused(tmp_path: Path, tracks: Path) -> None:
     (tmp_path / "m.obj").write_text(obj(FACES, vertices=P + 1))
     np.savez(tmp_path / "grid.npz", grid=np.arange(P - 6).reshape(ROWS - 1, COLUMNS))
     assert code_of(tracks, tmp_path / "m.obj") == "vertex_count_mismatch"
@@ -204,7 +204,7 @@ def test_points_on_a_line_get_no_mesh(tmp_path: Path) -> None:
     assert "too few distinct points" in notes[0]
 
 
-def test_vertices_that_are_no_list_are_refused(tmp_path: Path, tracks: Path) -> None:
+def test_vertices_that_are_a_scalar_are_refused(tmp_path: Path, tracks: Path) -> None:
     np.savez(tmp_path / "m.npz", vertices=np.float64(3), faces=FACES)
     assert code_of(tracks, tmp_path / "m.npz") == "vertex_count_mismatch"
 

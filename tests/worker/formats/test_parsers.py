@@ -67,20 +67,20 @@ LIST = PLY_FACE.replace("vertex_indices", "others")
         (read_hdf5, hdf5()[:600], Limits(), "damaged_file"),
     ],
 )
-def test_a_file_that_a_parser_refuses_has_a_code(
+def test_files_refused_by_a_parser_have_the_expected_code(
     reader: Callable[..., Arrays], content: bytes, limits: Limits, expected: str
 ) -> None:
     assert code(lambda: reader(io.BytesIO(content), field="mesh", limits=limits)) == expected
 
 
-def test_a_parser_that_runs_out_of_memory_refuses_the_file() -> None:
+def test_a_parser_out_of_memory_refuses_the_file() -> None:
     def hungry(stream: object, **given: object) -> Arrays:
         raise MemoryError
 
     assert code(lambda: parse(hungry, io.BytesIO(), field="tracks", limits=Limits())) == "too_large"
 
 
-def test_without_a_sandbox_only_arrays_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sandboxed_formats_are_refused_without_a_sandbox(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sandbox, "find_spec", lambda name: None)
     read = lambda: sandbox.parse_in_sandbox("obj", tmp_path / "m.obj", field="mesh", limits=Limits())  # noqa: E731
     assert code(read) == "unsupported_feature"
@@ -96,18 +96,18 @@ def test_a_file_larger_than_the_limit_is_refused_before_it_is_read(tmp_path: Pat
     assert code(lambda: arrays.read_file(tmp_path / "t.npy", field="tracks", limits=BRIEF)) == "too_large"
 
 
-def test_a_zip_with_a_directory_of_64_bits_is_refused(tmp_path: Path) -> None:
+def test_a_zip_with_a_64_bit_directory_is_refused(tmp_path: Path) -> None:
     (tmp_path / "t.npz").write_bytes(arrays.ZIP64_LOCATOR + bytes(16) + arrays.END_OF_DIRECTORY + bytes(18))
     assert code(lambda: arrays.check_directory(tmp_path / "t.npz", field="tracks")) == "too_large"
 
 
-def test_visibility_that_is_no_number_is_refused(tmp_path: Path) -> None:
+def test_complex_visibility_is_refused(tmp_path: Path) -> None:
     tracks = np.cumsum(np.random.default_rng(0).normal(size=(6, 20, 2)), axis=0)
     np.savez(tmp_path / "t.npz", tracks=tracks, visibility=np.ones((6, 20), dtype=complex))
     assert code(lambda: read_inputs(tracks=tmp_path / "t.npz", options=Options())) == "wrong_type"
 
 
-def test_a_mask_of_other_points_is_refused(tmp_path: Path) -> None:
+def test_a_mask_with_another_number_of_points_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "m.npz", mask=np.ones((3, 3), dtype=bool))
     read = lambda: read_surface(tmp_path / "m.npz", num_points=8, picture=None, limits=Limits())  # noqa: E731
     assert code(read) == "vertex_count_mismatch"

@@ -30,7 +30,7 @@ TABLE = np.concatenate([POINTS, np.full((F, P, 1), 0.9)], axis=2).reshape(F, 3 *
 
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Parse without the time that a child process takes to start."""
+    """Parse in this process, to save the start of a child."""
 
     def parse_here(parser: str, path: Path, *, field: str, limits: Limits) -> Arrays:
         with path.open("rb") as stream:
@@ -81,7 +81,7 @@ def test_named_columns_keep_their_spelling(here: None, tmp_path: Path) -> None:
     assert got.point_names == PARTS
     assert "The file names its 6 points: Nose, left_Ear, right ear, Kinn Ü, …." in got.interpretation.notes
     path = csv_of(tmp_path / "t.csv", [["Frame", *(f"İ{index}_{axis}" for index, axis in product(range(P), AXES))]])
-    assert read(path).point_names == tuple(f"i̇{index}" for index in range(P))  # the small letter has two signs
+    assert read(path).point_names == tuple(f"i̇{index}" for index in range(P))  # lower-case it has two code points
 
 
 def test_numbered_columns_have_no_names(here: None, tmp_path: Path) -> None:
@@ -91,14 +91,14 @@ def test_numbered_columns_have_no_names(here: None, tmp_path: Path) -> None:
     assert not any("names" in note for note in got.interpretation.notes[1:])
 
 
-def test_deeplabcut_tables(here: None, tmp_path: Path) -> None:
+def test_deeplabcut_csv_names_are_read(here: None, tmp_path: Path) -> None:
     assert read(deeplabcut(tmp_path / "t.csv")).point_names == PARTS
     both = tuple(f"{animal}/{part}" for animal in ("mouse1", "mouse2") for part in PARTS[:3])
     assert read(deeplabcut(tmp_path / "t.csv", individuals=True)).point_names == both
 
 
 @pytest.mark.parametrize("kind", ["table", "fixed"])
-def test_deeplabcut_hdf5(here: None, kind: str, tmp_path: Path) -> None:
+def test_deeplabcut_hdf5_names_are_read(here: None, kind: str, tmp_path: Path) -> None:
     columns = [("DLC", part, axis) for part, axis in product(PARTS, AXES)]
     assert read(deeplabcut_h5(tmp_path / "t.h5", columns, kind=kind)).point_names == PARTS
     columns = [("DLC", animal, part, axis) for animal, part, axis in product(("a", "b"), PARTS[:3], AXES)]
@@ -108,7 +108,7 @@ def test_deeplabcut_hdf5(here: None, kind: str, tmp_path: Path) -> None:
     assert read(deeplabcut_h5(tmp_path / "t.h5", columns, kind=kind)).point_names is None
 
 
-def test_deeplabcut_hdf5_with_odd_names_of_columns_is_read_without_them(here: None, tmp_path: Path) -> None:
+def test_deeplabcut_hdf5_with_invalid_column_names_has_no_names(here: None, tmp_path: Path) -> None:
     columns = [("DLC", part, axis) for part, axis in product(PARTS, AXES)]
     path = deeplabcut_h5(tmp_path / "t.h5", columns, kind="fixed")
     with h5py.File(path, "r+") as file:
@@ -124,7 +124,7 @@ def test_the_pickled_names_are_read_in_the_sandbox(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
-def test_strings_of_a_pickle_are_listed_and_nothing_is_run(protocol: int, tmp_path: Path) -> None:
+def test_pickled_strings_are_listed_without_running_code(protocol: int, tmp_path: Path) -> None:
     words = [("a", "b ü"), ("a", "c"), ("d", "b ü")]
     assert strings_of(pickle.dumps(words, protocol)) == ["a", "b ü", "a", "c", "d", "b ü"]
 
@@ -137,12 +137,12 @@ def test_strings_of_a_pickle_are_listed_and_nothing_is_run(protocol: int, tmp_pa
 
 
 @pytest.mark.parametrize("cut", range(6))
-def test_half_a_pickle_has_no_strings(cut: int) -> None:
+def test_a_truncated_pickle_has_no_strings(cut: int) -> None:
     assert strings_of(pickle.dumps(["abc"], 2)[: 2 + cut]) == []
 
 
 @pytest.mark.parametrize("texts", ["fixed", "variable"])
-def test_sleap_nodes(here: None, texts: str, tmp_path: Path) -> None:
+def test_sleap_node_names_are_read(here: None, texts: str, tmp_path: Path) -> None:
     nodes = [part.encode() for part in PARTS[:3]]
     kind = h5py.string_dtype() if texts == "variable" else f"S{max(map(len, nodes))}"
     given = np.stack([POINTS[:, :3], POINTS[:, 3:]], axis=1).transpose(1, 3, 2, 0)
@@ -170,7 +170,7 @@ def landmarks(count: int, **more: str) -> list[list[dict[str, Any]]]:
 @pytest.mark.parametrize(
     ("count", "names"), [(33, POSE), (21, HAND), (468, FACE), (478, IRISES), (543, None), (7, None)]
 )
-def test_mediapipe_landmarks_are_known_by_their_number(
+def test_mediapipe_names_are_chosen_by_the_number_of_landmarks(
     here: None, count: int, names: tuple[str, ...] | None, tmp_path: Path
 ) -> None:
     assert len(set(POSE)) == 33
@@ -183,7 +183,7 @@ def test_mediapipe_landmarks_are_known_by_their_number(
     assert read(csv_of(tmp_path / "t.csv", heads, values), image_size="640x480").point_names == names
 
 
-def test_landmarks_with_names_of_their_own_keep_them(here: None, tmp_path: Path) -> None:
+def test_named_landmarks_keep_their_names(here: None, tmp_path: Path) -> None:
     frames = landmarks(33)
     for number, landmark in enumerate(frames[0]):
         landmark["name"] = f"part {number}"
@@ -213,7 +213,7 @@ def test_an_npz_may_name_its_points(order: str, tmp_path: Path) -> None:
     assert read(path, layout=layout).point_names is None
 
 
-def test_the_file_of_pliant_track_may_name_its_points() -> None:
+def test_a_file_of_pliant_track_may_name_its_points() -> None:
     seen = {"visibility": np.ones((F, P)), "frame_indices": np.arange(F)}
     named: Arrays = {"tracks": POINTS, "point_names": np.array(PARTS), **seen}
     assert understand(named, Options()).point_names == PARTS
@@ -233,7 +233,7 @@ def test_the_file_of_pliant_track_may_name_its_points() -> None:
     ],
     ids=["too few", "two axes", "numbers", "objects", "not Unicode"],
 )
-def test_names_that_do_not_fit_are_refused(
+def test_invalid_point_names_are_refused(
     names: np.ndarray, code: str, expected: str | None, got: str, tmp_path: Path
 ) -> None:
     np.savez(tmp_path / "t.npz", tracks=POINTS, point_names=names)
@@ -255,7 +255,7 @@ def test_names_follow_the_selected_points_and_survive_storage(here: None, tmp_pa
     assert load_inputs(tmp_path / "inputs.npz").point_names == got.point_names
 
 
-def test_names_are_lines_that_can_be_printed(here: None, tmp_path: Path) -> None:
+def test_names_are_normalised_to_printable_lines(here: None, tmp_path: Path) -> None:
     odd = ["a\tb", " c  d ", "\ud800", "x" * 300, "e\u0301", "🙂"]
     frames = landmarks(P)
     for frame in frames:

@@ -1,4 +1,4 @@
-"""Spreadsheets, DeepLabCut, SLEAP and MediaPipe: what is read, and the exact words of what is not."""
+"""Spreadsheets, DeepLabCut, SLEAP and MediaPipe: what is read, and the exact message for what is refused."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EXAMPLE = "Write it as in `frame,point,x,y` and then `0,0,312.5,200.1`, or one r
 
 @pytest.fixture(autouse=True)
 def _here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Parse without the time that a child process takes to start; tests/worker/formats/test_containers.py starts one."""
+    """Parse in this process, to save the start of a child; tests/worker/formats/test_containers.py starts one."""
 
     def parse_here(parser: str, path: Path, *, field: str, limits: Limits) -> Arrays:
         with path.open("rb") as stream:
@@ -83,7 +83,7 @@ TABLES = {
 
 
 @pytest.mark.parametrize("case", TABLES)
-def test_a_table_is_read(case: str, tmp_path: Path) -> None:
+def test_every_kind_of_table_is_read(case: str, tmp_path: Path) -> None:
     text, form, hides = TABLES[case]
     path = tmp_path / "tracks.csv"
     path.write_text(f"\ufeff{text}\r\n".replace("\n", "\r\n"), encoding="utf-8")
@@ -144,7 +144,7 @@ MEDIAPIPE = {
 
 
 @pytest.mark.parametrize("case", MEDIAPIPE)
-def test_mediapipe_json(case: str, tmp_path: Path) -> None:
+def test_every_form_of_mediapipe_json_is_read(case: str, tmp_path: Path) -> None:
     (tmp_path / "pose.json").write_text("\ufeff" * (case == "lists") + json.dumps(MEDIAPIPE[case]), encoding="utf-8")
     read = read_inputs(tracks=tmp_path / "pose.json", mesh="none", options=Options(image_size="641x481"))
     assert (read.interpretation.format, read.interpretation.coordinates) == ("MediaPipe", "unit")
@@ -154,7 +154,7 @@ def test_mediapipe_json(case: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("nothing", [None, [], {"landmarks": []}, {"poseLandmarks": None}])
-def test_a_frame_of_mediapipe_without_a_detection_is_hidden(nothing: object, tmp_path: Path) -> None:
+def test_a_mediapipe_frame_without_a_detection_is_hidden(nothing: object, tmp_path: Path) -> None:
     frames = [*MEDIAPIPE["lists"][:2], nothing, *MEDIAPIPE["lists"][3:]]
     (tmp_path / "pose.json").write_text(json.dumps(frames))
     read = read_inputs(tracks=tmp_path / "pose.json", mesh="none", options=Options(image_size="641x481"))
@@ -163,7 +163,7 @@ def test_a_frame_of_mediapipe_without_a_detection_is_hidden(nothing: object, tmp
 
 
 @pytest.mark.parametrize("kind", ["table", "fixed"])
-def test_deeplabcut_hdf5(kind: str, tmp_path: Path) -> None:
+def test_deeplabcut_hdf5_is_read(kind: str, tmp_path: Path) -> None:
     values = np.concatenate([POINTS, SURE[..., None]], axis=2).reshape(F, 3 * P)
     with h5py.File(tmp_path / "dlc.h5", "w") as file:
         group = file.create_group("df_with_missing")
@@ -179,7 +179,7 @@ def test_deeplabcut_hdf5(kind: str, tmp_path: Path) -> None:
     assert (read.tracks.visible[SURE < 0.5] == 0).all()
 
 
-def test_sleap_analysis(tmp_path: Path) -> None:
+def test_a_sleap_analysis_file_is_read(tmp_path: Path) -> None:
     given = np.stack([POINTS[:, :3], POINTS[:, 3:]], axis=1)  # frames, instances, nodes, 2
     given[2, 1] = np.nan
     with h5py.File(tmp_path / "sleap.h5", "w") as file:
@@ -302,7 +302,7 @@ REFUSED: dict[str, tuple[bytes, str, str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_a_refusal_says_what_was_seen_and_what_to_do(case: str, tmp_path: Path) -> None:
+def test_refusals_state_what_was_found_and_what_to_do(case: str, tmp_path: Path) -> None:
     content, code, sentence = REFUSED[case]
     (tmp_path / "tracks").write_bytes(content)
     with pytest.raises(InvalidInput) as caught:
@@ -314,7 +314,7 @@ def test_a_refusal_says_what_was_seen_and_what_to_do(case: str, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("part", "kinds"), [("mesh", "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"), ("ground_truth", FILES)]
 )
-def test_a_spreadsheet_as_another_input_is_refused(part: str, kinds: str, tmp_path: Path) -> None:
+def test_a_spreadsheet_as_mesh_or_truth_is_refused(part: str, kinds: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "tracks.npz", tracks=POINTS)
     (tmp_path / "table").write_bytes(spreadsheet("[Content_Types].xml", "xl/workbook.xml"))
     with pytest.raises(InvalidInput) as caught:
@@ -324,7 +324,7 @@ def test_a_spreadsheet_as_another_input_is_refused(part: str, kinds: str, tmp_pa
     )
 
 
-def test_a_table_that_is_not_deeplabcuts_is_refused(tmp_path: Path) -> None:
+def test_an_hdf5_table_without_deeplabcut_columns_is_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "dlc.h5", "w") as file:
         file.create_group("df")["block0_values"] = np.full((F, 7), 3.0)
     with pytest.raises(InvalidInput) as caught:
@@ -336,7 +336,7 @@ def test_a_table_that_is_not_deeplabcuts_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["virtual", "external", "link", "claimed", "claimed table"])
-def test_attacks_through_pose_files_are_refused(kind: str, tmp_path: Path) -> None:
+def test_crafted_pose_files_are_refused(kind: str, tmp_path: Path) -> None:
     secret = tmp_path / "secret"
     secret.write_bytes(np.arange(1000.0).tobytes())
     with h5py.File(tmp_path / "other.h5", "w") as file:

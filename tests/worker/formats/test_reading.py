@@ -17,7 +17,7 @@ F, P = 12, 30
 
 
 def waving(frames: int = F, points: int = P) -> np.ndarray:
-    """Tracks of a turning random cloud: smooth in time, unordered over the points."""
+    """Tracks of a rotating random cloud: smooth in time, points in no order."""
     cloud = np.random.default_rng(5).normal(size=(points, 3)) * 40
     angles = np.linspace(0, 0.6, frames)
     rows = np.stack(
@@ -49,7 +49,7 @@ def refused(code: str, act: Callable[[], object]) -> InvalidInput:
     return caught.value
 
 
-def test_canonical_tracks_are_read_as_they_are(tmp_path: Path) -> None:
+def test_canonical_tracks_are_read_unchanged(tmp_path: Path) -> None:
     tracks = waving()
     visible = np.random.default_rng(0).random((F, P)) > 0.2
     got = read(tmp_path, tracks=tracks, visibility=visible)
@@ -81,7 +81,7 @@ def test_a_bare_npy_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rows", ["interleaved", "stacked"])
 @pytest.mark.parametrize("file", ["mat", "npz"])
-def test_a_matrix_is_read_whichever_way_its_rows_go(tmp_path: Path, rows: str, file: str) -> None:
+def test_a_matrix_is_read_with_interleaved_or_stacked_rows(tmp_path: Path, rows: str, file: str) -> None:
     tracks = waving()
     matrix = (
         tracks.transpose(0, 2, 1).reshape(2 * F, P)
@@ -147,7 +147,7 @@ def test_inputs_survive_storage_bit_for_bit(tmp_path: Path) -> None:
         assert not theirs.flags.writeable
 
 
-def test_the_store_is_small_where_single_precision_holds_the_values(tmp_path: Path) -> None:
+def test_inputs_that_fit_single_precision_are_stored_compactly(tmp_path: Path) -> None:
     for dtype, name in ((np.float32, "single"), (np.float64, "double")):
         tracks = waving(40, 200).astype(dtype)
         save_inputs(
@@ -174,7 +174,7 @@ BAD_TRACKS = {
 
 
 @pytest.mark.parametrize("code", BAD_TRACKS)
-def test_bad_tracks_are_refused_by_their_code(tmp_path: Path, code: str) -> None:
+def test_invalid_tracks_are_refused_with_their_code(tmp_path: Path, code: str) -> None:
     refused(code, lambda: read(tmp_path, **BAD_TRACKS[code]))
 
 
@@ -200,7 +200,7 @@ def test_text_with_the_suffix_npz_is_rejected(tmp_path: Path) -> None:
         (bytes([1, 2, 3, 0]) * 9, "a file of an unknown kind, which begins with the bytes 01 02 03 00 01 02 03 00"),
     ],
 )
-def test_a_file_of_another_kind_is_named_in_words(tmp_path: Path, content: bytes, words: str) -> None:
+def test_the_error_names_the_kind_of_an_unsupported_file(tmp_path: Path, content: bytes, words: str) -> None:
     (tmp_path / "tracks").write_bytes(content)
     error = refused("unknown_format", lambda: read_inputs(tracks=tmp_path / "tracks", options=Options()))
     assert error.got == words
@@ -215,12 +215,12 @@ def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     "limits",
     [Limits(max_frames=F - 1), Limits(max_points=P - 1), Limits(max_observations=F * P - 1), Limits(max_bytes=900)],
 )
-def test_more_than_the_limits_is_refused(tmp_path: Path, limits: Limits) -> None:
+def test_inputs_above_a_limit_are_refused(tmp_path: Path, limits: Limits) -> None:
     path = saved(tmp_path / "t.npz", tracks=waving())
     refused("too_large", lambda: read_inputs(tracks=path, options=Options(), limits=limits))
 
 
-def test_exactly_the_limits_is_read(tmp_path: Path) -> None:
+def test_inputs_at_the_limits_are_read(tmp_path: Path) -> None:
     path = saved(tmp_path / "t.npz", tracks=waving())
     size = path.stat().st_size
     limits = Limits(max_frames=F, max_points=P, max_observations=F * P, max_bytes=size)
@@ -241,7 +241,7 @@ def test_truth_must_match_the_tracks(tmp_path: Path) -> None:
         assert error.field.startswith("ground_truth")
 
 
-def test_truth_rotations_must_be_one_a_frame(tmp_path: Path) -> None:
+def test_truth_needs_one_rotation_per_frame(tmp_path: Path) -> None:
     tracks = saved(tmp_path / "t.npz", tracks=waving())
     truth = saved(
         tmp_path / "g.npz",
@@ -269,10 +269,10 @@ def test_given_cameras_are_completed_and_checked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["visibility", "expected_dist"])
-def test_more_visibility_than_tracks_is_refused_before_it_is_converted(
+def test_visibility_larger_than_the_tracks_is_refused_before_conversion(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A file of .88 MB with 900 MB of zeros as visibility took 7.8 GB."""
+    """A file of 0.88 MB with 900 MB of zeros as visibility used to take 7.8 GB."""
     monkeypatch.setattr("pliant.worker.formats.tracks.visibility._confidence", None)  # not reached
     tracks = moving_sheet(6, 4, 5)[..., :2] + 100
     arrays = {"visibility": np.ones((6, 20)), name: np.zeros((600, 2000), bool)}
@@ -283,7 +283,7 @@ def test_more_visibility_than_tracks_is_refused_before_it_is_converted(
 
 
 @pytest.mark.parametrize("where", [0.0, 300.0])
-def test_tracks_of_one_position_are_refused_when_they_are_read(tmp_path: Path, where: float) -> None:
+def test_tracks_with_all_points_in_one_position_are_refused(tmp_path: Path, where: float) -> None:
     points = np.full((6, 20, 2), where) + np.arange(6)[:, None, None]
     np.savez(tmp_path / "t.npz", tracks=points)
     with pytest.raises(InvalidInput, match="one position for all points") as caught:

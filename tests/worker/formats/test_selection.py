@@ -47,7 +47,7 @@ def cross(one: np.ndarray, two: np.ndarray) -> np.ndarray:
 
 
 def follows(got: Inputs, frames: np.ndarray, points: np.ndarray) -> None:
-    """Tracks, truth, cameras and the record of what was chosen are these frames and points of the files."""
+    """Check that tracks, truth, cameras and the selection record hold these frames and points of the files."""
     assert got.ground_truth is not None
     assert got.ground_truth.rotations is not None
     assert got.cameras is not None
@@ -68,7 +68,7 @@ numbers = st.one_of(st.none(), st.integers(-15, 15))
 
 
 @given(numbers, numbers, st.one_of(st.none(), st.integers(1, 4)), st.booleans())
-def test_frames_are_counted_as_python_counts(
+def test_frames_are_selected_as_by_a_python_slice(
     start: int | None, stop: int | None, step: int | None, short: bool
 ) -> None:
     words = ["" if part is None else str(part) for part in (start, stop, step)]
@@ -84,12 +84,12 @@ def test_frames_are_counted_as_python_counts(
 
 
 @pytest.mark.parametrize("text", ["1", "1:2:0", "1:2:-1", "a:b", "1:2:3:4", "", " 1:2"])
-def test_other_ways_to_write_frames_are_refused(text: str) -> None:
+def test_invalid_frame_ranges_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="frames"):
         Options(frames=text)
 
 
-def test_frames_choose_tracks_truth_and_cameras_alike(folder: Path) -> None:
+def test_frame_selection_applies_to_tracks_truth_and_cameras(folder: Path) -> None:
     got = read(folder, f"{ROWS}x{COLUMNS}", frames="1:9:2")
     follows(got, np.arange(1, 9, 2), np.arange(P))
     assert any("one in 2, so at the same fps" in note for note in got.interpretation.notes)
@@ -104,10 +104,10 @@ def test_a_grid_keeps_every_nth_row_and_column(folder: Path, how: dict[str, int]
     assert got.mesh is not None
     assert got.mesh.grid is not None
     np.testing.assert_array_equal(got.mesh.grid, np.arange(kept.size).reshape(kept.shape))
-    assert any("every 3. row and column" in note for note in got.interpretation.notes)
+    assert any("one in 3 rows and columns" in note for note in got.interpretation.notes)
 
 
-def test_a_stride_that_leaves_nothing_is_refused(folder: Path) -> None:
+def test_a_stride_that_leaves_too_few_points_is_refused(folder: Path) -> None:
     with pytest.raises(InvalidInput, match="leaves 4 points or more") as caught:
         read(folder, f"{ROWS}x{COLUMNS}", stride=1000)
     assert (caught.value.code, caught.value.field) == ("too_few_points", "options.stride")
@@ -160,17 +160,17 @@ def test_components_of_a_mesh_stay_separate_and_each_keeps_points() -> None:
     parts = np.repeat(np.arange(P), 2)
     assert (
         len(spread(far[:2], np.ones((2, 2 * P), dtype=bool), 10, parts)) == 10
-    )  # more parts than points: some parts go
+    )  # more parts than points: some parts are dropped
 
 
-def test_a_list_is_thinned_by_number_or_spread_evenly(folder: Path) -> None:
+def test_points_without_a_mesh_are_thinned_by_index_or_evenly_in_space(folder: Path) -> None:
     assert read(folder, "none", stride=7).selection.points.tolist() == list(range(0, P, 7))  # type: ignore[union-attr]
     got = read(folder, "none", max_points=50)
     assert got.selection is not None
     assert 40 <= got.tracks.num_points <= 50
     flat = got.tracks.points[0]
     apart = np.linalg.norm(flat[:, None] - flat[None], axis=2) + 1e9 * np.eye(len(flat))
-    assert apart.min() > 9  # the sheet's own spacing is 10: no two of the same place
+    assert apart.min() > 9  # the sheet's spacing is 10: no two points share a place
     made = read(folder, None, max_points=50)
     assert made.mesh is not None
     assert made.interpretation.mesh_source == "delaunay"

@@ -27,7 +27,7 @@ QUICK = {"method": "temporal", "refine_rotations": False, "basis_size": 1, "y_ax
 
 
 def parse_here(parser: str, path: Path, *, field: str, limits: Limits) -> Arrays:
-    """The same parser without the time that a child process takes to start; `pliant inspect` below starts one."""
+    """Call the parser in this process, to save the start of a child; `pliant inspect` below starts one."""
     with path.open("rb") as stream:
         return PARSERS[parser](stream, field=field, limits=limits)
 

@@ -1,4 +1,4 @@
-"""Estimates of memory, and what is refused or left to another worker because of them."""
+"""Estimates of memory and time, and the jobs that are refused or put back because of them."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ print(sequence.tracks.num_points, int(peak[1]) * 1024)
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads kilobytes")
 @pytest.mark.parametrize(("frames", "points", "prior"), [(8, 500, "gaussian"), (10, 20_000, "smooth")])
-def test_the_estimate_is_within_a_factor_of_two(frames: int, points: int, prior: str) -> None:
+def test_the_memory_estimate_is_within_a_factor_of_two_of_a_real_job(frames: int, points: int, prior: str) -> None:
     env = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     command = [sys.executable, "-c", MEASURE, str(frames), str(points), prior]
     ran = subprocess.run(command, env=env, capture_output=True, text=True, check=True, timeout=250)
@@ -58,7 +58,7 @@ def test_the_estimate_is_within_a_factor_of_two(frames: int, points: int, prior:
     assert peak / 2 < estimate < 2 * peak, (peak, estimate)
 
 
-def test_what_fits_is_what_the_estimate_says() -> None:
+def test_the_largest_job_that_fits_just_meets_the_memory_limit() -> None:
     for prior in ("gaussian", "smooth", "smooth+low_rank"):
         options = Options(prior=prior)
         points, frames = largest_that_fits(2_000_000_000, 50, 1000, options)
@@ -80,11 +80,11 @@ SECONDS = (
     (100, 500, {"prior": "smooth"}, 5.2), (30, 5_000, {"prior": "smooth"}, 2.1), (100, 500, {"has_rotations": True}, 4.4),
     (30, 5_000, {"has_rotations": True}, 2.2),
 )  # fmt: skip
-"""Frames, points, what is not the default, and processor seconds that were measured."""
+"""Frames, points, what differs from the default, and measured processor seconds."""
 
 
 @pytest.mark.parametrize(("frames", "points", "given", "seconds"), SECONDS)
-def test_the_time_is_within_a_factor_of_two_of_what_was_measured(
+def test_the_time_estimate_is_within_a_factor_of_two_of_measurements(
     frames: int, points: int, given: dict[str, Any], seconds: float
 ) -> None:
     options = Options(**{name: value for name, value in given.items() if name == "prior"})
@@ -94,18 +94,18 @@ def test_the_time_is_within_a_factor_of_two_of_what_was_measured(
 
 MEMORY = ((50, 20_000, "gaussian", 0.34e9), (10, 60_000, "smooth", 0.24e9), (30, 20_000, "smooth+low_rank", 0.31e9),
           (50, 200_000, "gaussian", 2.9e9), (100, 1_000_000, "gaussian", 11.6e9))  # fmt: skip
-"""Frames, points, prior, and the largest memory that was measured, bytes: of the first three in jobs, of the others in the solver."""
+"""Frames, points, prior, and measured peak memory in bytes: the first three in jobs, the others in the solver."""
 
 
 @pytest.mark.parametrize(("frames", "points", "prior", "peak"), MEMORY)
-def test_the_memory_is_within_a_factor_of_two_of_what_was_measured(
+def test_the_memory_estimate_is_within_a_factor_of_two_of_measurements(
     frames: int, points: int, prior: str, peak: float
 ) -> None:
     estimate = estimated(frames, points, Options(prior=prior)).memory_bytes  # type: ignore[arg-type]
     assert peak / 2 < estimate < 2 * peak
 
 
-def test_the_time_of_a_hundred_million_observations_is_within_a_factor_of_two_of_what_was_measured() -> None:
+def test_the_time_estimate_holds_for_a_hundred_million_observations() -> None:
     assert 520 / 2 < estimated(100, 1_000_000, Options()).seconds < 2 * 520
 
 
@@ -116,7 +116,7 @@ def interpretation(frames: int, points: int) -> Interpretation:
     )  # fmt: skip
 
 
-def test_a_job_that_fits_no_worker_is_refused_with_what_would_fit() -> None:
+def test_a_job_too_large_for_every_worker_is_refused_with_a_size_that_fits() -> None:
     large = interpretation(100, 100_000)
     with pytest.raises(InvalidRequest) as caught:
         check_fits(large, Options(), [1_000_000_000, 2_000_000_000])
@@ -134,7 +134,7 @@ def test_a_job_that_fits_no_worker_is_refused_with_what_would_fit() -> None:
     check_fits(large.model_copy(update={"estimate": None}), Options(), [1])
 
 
-def test_inputs_come_with_their_estimate(tmp_path: Path) -> None:
+def test_inputs_include_their_cost_estimate(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     paths = generator.normal(size=(6, 40, 2)).cumsum(axis=0) + 100 * generator.normal(size=(40, 2))
     np.save(tmp_path / "t.npy", paths)
@@ -142,7 +142,7 @@ def test_inputs_come_with_their_estimate(tmp_path: Path) -> None:
     assert found.interpretation.estimate == estimated(6, 40, Options())
 
 
-def test_the_memory_of_a_job_is_its_limit_and_its_share(tmp_path: Path) -> None:
+def test_memory_for_a_job_is_its_limit_or_its_share_of_the_machine(tmp_path: Path) -> None:
     group = tmp_path / "memory.max"
     group.write_text("max\n")
     physical = memory_for_a_job(Settings(), group=group)
@@ -168,11 +168,11 @@ def alive(jobs: Jobs, name: str, memory: str) -> None:
     client.close()
 
 
-def test_a_submission_asks_the_workers_that_run(jobs: Jobs, inputs_file: Path) -> None:
+def test_a_submission_is_checked_against_the_running_workers(jobs: Jobs, inputs_file: Path) -> None:
     large, submission = interpretation(100, 100_000), Submission(options=Options())
     assert jobs.queue.memories() == {}
     jobs.submit(inputs_file, submission, interpretation=large)
-    alive(jobs, "old", "")  # of a version that states none
+    alive(jobs, "old", "")  # an older version, which states no memory
     alive(jobs, "small", " 500000000")
     assert jobs.queue.memories() == {"small": 500_000_000}
     with pytest.raises(InvalidRequest, match=r"0\.5 GB"):
@@ -183,10 +183,8 @@ def test_a_submission_asks_the_workers_that_run(jobs: Jobs, inputs_file: Path) -
 
 
 @pytest.mark.slow
-def test_a_worker_leaves_a_job_that_is_too_large_to_a_larger_one(
-    settings: Settings, inputs_files: tuple[Path, Path]
-) -> None:
-    """The small worker is asked first and puts the job back; the large one does it."""
+def test_a_worker_puts_back_a_job_that_is_too_large_for_it(settings: Settings, inputs_files: tuple[Path, Path]) -> None:
+    """A larger worker is registered but does not run, so the job stays queued."""
     small = replace(settings, memory_limit=UNUSED + (1 << 30), threads=1)
     with House(small, inputs=inputs_files) as house:
         alive(house.jobs, "large", f" {1 << 60}")

@@ -48,7 +48,7 @@ def solved(jobs: Jobs, tmp_path: Path) -> Job:
     return done
 
 
-def test_the_files_are_those_that_the_job_itself_would_have_written(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
+def test_further_outputs_equal_those_of_the_solving_job(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
     more, new = make_outputs(jobs, solved.id, OutputRequest(outputs=("ply",)))
     assert new
     done = run(jobs, more, tmp_path / "w")
@@ -58,7 +58,7 @@ def test_the_files_are_those_that_the_job_itself_would_have_written(jobs: Jobs, 
     assert findings(jobs, pause=0) == []
 
 
-def test_deleting_the_solved_job_does_not_end_the_other(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
+def test_further_outputs_survive_deletion_of_the_solved_job(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
     more, _ = make_outputs(jobs, solved.id, WANTED)
     jobs.delete(solved.id)
     assert run(jobs, more, tmp_path / "w").status is Status.SUCCEEDED
@@ -66,7 +66,7 @@ def test_deleting_the_solved_job_does_not_end_the_other(jobs: Jobs, solved: Job,
         make_outputs(jobs, solved.id, WANTED)
 
 
-def test_files_that_vanish_before_they_are_copied_leave_nothing(jobs: Jobs, solved: Job) -> None:
+def test_a_result_that_vanishes_before_copying_leaves_no_job_or_files(jobs: Jobs, solved: Job) -> None:
     stored = jobs.stored(solved.id)
     jobs.blobs.delete(f"{stored.prefix}shapes.npz")
     with pytest.raises(UnknownJob):
@@ -75,7 +75,7 @@ def test_files_that_vanish_before_they_are_copied_leave_nothing(jobs: Jobs, solv
     assert {key.split("/")[1] for key, _ in jobs.blobs.list("jobs/")} == {solved.id}
 
 
-def test_a_cancelled_one_is_made_anew_and_can_be_retried(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
+def test_a_cancelled_output_job_is_created_again_and_can_be_retried(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
     more, _ = make_outputs(jobs, solved.id, WANTED)
     assert make_outputs(jobs, solved.id, WANTED) == (jobs.get(more.id), False)
     jobs.cancel(more.id)
@@ -97,7 +97,7 @@ def test_a_cancelled_one_is_made_anew_and_can_be_retried(jobs: Jobs, solved: Job
         make_outputs(jobs, solved.id, OutputRequest(outputs=("csv",)), idempotency_key="mine")
 
 
-def test_a_retried_one_says_what_the_result_says(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
+def test_a_retried_output_job_keeps_metrics_and_verdict(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
     said = ("metrics", "outcome", "sentence", "verdict", "verdict_reasons", "trust_sentence", "warnings")
     more, _ = make_outputs(jobs, solved.id, WANTED)
     jobs.cancel(more.id)
@@ -111,7 +111,7 @@ def test_a_retried_one_says_what_the_result_says(jobs: Jobs, solved: Job, tmp_pa
     assert solved.verdict is not None
 
 
-def test_it_counts_against_queue_and_quota(jobs: Jobs, solved: Job) -> None:
+def test_output_jobs_count_against_queue_limit_and_quota(jobs: Jobs, solved: Job) -> None:
     one = dataclasses.replace(jobs, max_queued=1)
     make_outputs(one, solved.id, WANTED)
     with pytest.raises(TooManyQueued):
@@ -121,21 +121,21 @@ def test_it_counts_against_queue_and_quota(jobs: Jobs, solved: Job) -> None:
         make_outputs(full, solved.id, OutputRequest(outputs=("csv",)))
 
 
-def test_who_and_what_is_refused(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
+def test_strangers_and_output_jobs_cannot_request_further_outputs(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
     with pytest.raises(UnknownJob):
         make_outputs(jobs.of("stranger"), solved.id, WANTED)
     more, _ = make_outputs(jobs, solved.id, WANTED)
     with pytest.raises(NotAllowedNow) as caught:
         make_outputs(jobs, more.id, WANTED)
     assert str(caught.value) == (
-        f"Job {more.id!r} has the status queued: it cannot be written in further files now. "
+        f"Job {more.id!r} has the status queued: it cannot be exported to further files now. "
         f"It holds further files of job {solved.id!r}: make them from that one."
     )
-    with pytest.raises(NotAllowedNow, match="name that one"):
+    with pytest.raises(NotAllowedNow, match="use that job"):
         jobs.kept_inputs(more.id, tmp_path / "kept.npz")
 
 
-def test_a_damaged_result_ends_the_job_with_a_reason(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
+def test_a_damaged_result_fails_the_job_with_a_reason(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
     more, _ = make_outputs(jobs, solved.id, WANTED)
     key = jobs.records.get(more.id).result
     assert key is not None
@@ -149,7 +149,7 @@ def test_a_damaged_result_ends_the_job_with_a_reason(jobs: Jobs, solved: Job, tm
     assert done.error.code == "damaged_file"
 
 
-def test_files_that_do_not_belong_together_are_refused(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
+def test_inconsistent_or_damaged_files_are_refused(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
     np.savez(tmp_path / "r.npz", shapes=np.zeros((2, 3, 3)))
     with pytest.raises(InvalidInput, match=r"a shapes\.npz without"):
         read_solution(tmp_path / "r.npz", y_up=False)

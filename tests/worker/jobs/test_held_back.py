@@ -15,7 +15,7 @@ from pliant.worker.maintenance.reconciler import Reconciler
 from reconciler_world import World
 
 
-def test_the_limit_of_running_jobs_holds_and_the_next_starts_when_one_ends(
+def test_the_running_limit_holds_and_the_next_job_starts_when_one_ends(
     tmp_path: Path, inputs_file: Path, interpretation: Interpretation
 ) -> None:
     world = World(tmp_path, max_running=2)
@@ -89,7 +89,7 @@ def test_a_new_reconciler_knows_the_held_back_jobs(
         world.jobs.submit(inputs_file, Submission(options=Options(), id=f"job-{n}"), interpretation=interpretation).id
         for n in "12"
     )
-    world.jobs.queue.release(world.jobs.records.get(second).attempt_id)  # as if nobody had had the time to note it
+    world.jobs.queue.release(world.jobs.records.get(second).attempt_id)  # as if there had been no time to note it
     world.pass_seconds(1)
     assert world.jobs.queue.held() == {world.jobs.records.get(second).attempt_id}
     world.reconciler = Reconciler(jobs=world.jobs, clock=lambda: world.monotonic)
@@ -119,7 +119,7 @@ def test_a_job_on_its_way_to_a_worker_counts_as_running(
     assert world.jobs.get(second).status is Status.QUEUED
 
 
-def test_a_tokens_own_limit_of_running_jobs_takes_precedence(
+def test_a_tokens_running_limit_overrides_the_default(
     tmp_path: Path, inputs_file: Path, interpretation: Interpretation
 ) -> None:
     world = World(tmp_path, max_running=2)

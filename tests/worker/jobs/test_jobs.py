@@ -50,7 +50,7 @@ def finish(jobs: Jobs, id: str, file: Path) -> Stored:
             stored,
             Finished(
                 metrics={"reprojection_median": 0.5}, outcome="converged", sentence="Converged.", warnings=(), artifacts=(artifact,),
-                verdict="with_care", verdict_reasons=("The camera turned by 9° only.",), trust_sentence="Expected error about 4 %.",
+                verdict="with_care", verdict_reasons=("The camera turned by only 9°.",), trust_sentence="Expected error about 4 %.",
             ),
             attempt_id=attempt_id, prefix=prefix, now=NOW, retention=60,
         ),
@@ -61,7 +61,7 @@ def blob_names(jobs: Jobs) -> list[str]:
     return [key for key, _ in jobs.blobs.list("jobs/")]
 
 
-def test_a_submitted_job_has_record_blob_and_place(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+def test_a_submitted_job_has_a_record_a_blob_and_a_queue_position(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
     first, second = submit(name="first"), submit(name="second")
     assert (first.status, first.place_in_queue, second.place_in_queue) == (Status.QUEUED, 0, 1)
     assert jobs.get(second.id) == second
@@ -105,7 +105,7 @@ def test_invalid_cursors_and_limits_are_rejected(jobs: Jobs, arguments: dict[str
     assert caught.value.code == code
 
 
-def test_an_owner_sees_only_own_jobs(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_owners_see_only_their_own_jobs(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     ann, bob = jobs.of("ann"), jobs.of("bob")
     hers, his = submit(ann), submit(bob)
     assert ann.get(hers.id).id == hers.id
@@ -130,7 +130,7 @@ def test_a_repeated_request_returns_the_first_job(jobs: Jobs, submit) -> None:  
     assert len(blob_names(jobs)) == 2
 
 
-def test_a_chosen_id_is_taken_once(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_a_chosen_id_can_be_used_only_once(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     assert submit(id="mine", fingerprint="f").id == "mine"
     assert submit(id="mine", fingerprint="f").id == "mine"
     for more in ({"fingerprint": "other"}, {}):
@@ -166,7 +166,7 @@ def test_simultaneous_requests_with_one_key_make_one_job(jobs: Jobs, submit) -> 
     assert len(jobs.queue.waiting()) == 1
 
 
-def test_only_the_owning_attempt_writes(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_only_the_current_attempt_can_change_a_job(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     id = submit().id
     old = claim(jobs, id).attempt_id
     with pytest.raises(StaleAttempt):
@@ -193,7 +193,7 @@ def test_only_the_owning_attempt_writes(jobs: Jobs, submit) -> None:  # type: ig
     assert jobs.records.get(id) == before
 
 
-def test_a_claim_whose_reply_was_lost_is_repeated(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_a_claim_can_be_repeated_if_its_reply_was_lost(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     id = submit().id
     first = claim(jobs, id)
     assert claim(jobs, id) == first == jobs.records.get(id)
@@ -217,7 +217,7 @@ def test_an_attempt_stops_only_for_a_cancellation(jobs: Jobs, submit) -> None:  
     assert jobs.get(own.job.id).status is Status.RUNNING
 
 
-def test_a_job_that_keeps_losing_workers_fails_at_last(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_a_job_fails_after_losing_too_many_workers(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     id = submit().id
     for attempt in (1, 2):
         attempt_id = claim(jobs, id).attempt_id
@@ -237,7 +237,7 @@ def test_a_job_that_keeps_losing_workers_fails_at_last(jobs: Jobs, submit) -> No
     assert after.job.expires_at == NOW + timedelta(seconds=60)
 
 
-def test_cancelling(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+def test_unfinished_jobs_can_be_cancelled_and_finished_ones_cannot(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
     queued, running, done = submit(), submit(), submit()
     assert jobs.cancel(queued.id).status is Status.CANCELLED
     attempt_id = claim(jobs, running.id).attempt_id
@@ -265,7 +265,7 @@ def test_a_result_is_published_and_read_in_ranges(jobs: Jobs, submit, inputs_fil
     job = jobs.get(id)
     assert (job.status, job.outcome, job.metrics) == (Status.SUCCEEDED, "converged", {"reprojection_median": 0.5})
     assert (job.verdict, job.trust_sentence) == ("with_care", "Expected error about 4 %.")
-    assert job.verdict_reasons == ["The camera turned by 9° only."]
+    assert job.verdict_reasons == ["The camera turned by only 9°."]
     artifact, blob = jobs.artifact(id, "report.json")
     assert artifact.bytes == blob.size == 3_000_000
     assert sum(len(chunk) for chunk in blob.read(10, 2_500_000)) == 2_499_990
@@ -276,7 +276,7 @@ def test_a_result_is_published_and_read_in_ranges(jobs: Jobs, submit, inputs_fil
         jobs.artifact(id, "shapes.npz")
 
 
-def test_deleting_leaves_nothing(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+def test_deleting_a_job_removes_its_record_files_and_log(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
     id = submit(idempotency_key="k", fingerprint="f").id
     with pytest.raises(NotAllowedNow, match="Cancel it first"):
         jobs.delete(id)
@@ -295,7 +295,7 @@ def test_deleting_leaves_nothing(jobs: Jobs, submit, inputs_file: Path) -> None:
     assert submit(idempotency_key="k", fingerprint="g").id != id, "the key is free again"
 
 
-def test_a_job_that_takes_the_id_during_a_deletion_keeps_its_files(
+def test_a_new_job_with_the_id_of_one_being_deleted_keeps_its_files(
     jobs: Jobs,
     submit,  # type: ignore[no-untyped-def]
     inputs_file: Path,
@@ -316,7 +316,7 @@ def test_a_job_that_takes_the_id_during_a_deletion_keeps_its_files(
     assert blob_names(jobs) == [jobs.records.get("nightly").inputs]
 
 
-def test_what_a_lost_attempt_left_is_noted_for_the_reconciler(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+def test_leftovers_of_a_lost_attempt_are_noted_for_the_reconciler(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
     id = submit().id
     finish(jobs, id, inputs_file)
     left = f"jobs/{id}/{id}-lost/artifacts/shapes.npz"
@@ -326,7 +326,7 @@ def test_what_a_lost_attempt_left_is_noted_for_the_reconciler(jobs: Jobs, submit
     assert list(jobs.records.deleted()) == [id]
 
 
-def test_running_again_is_a_new_job_with_the_same_inputs(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+def test_a_retry_is_a_new_job_with_the_same_inputs(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
     old = submit(jobs.of("ann"), name="n")
     with pytest.raises(NotAllowedNow, match="cancel it first"):
         retry(jobs, old.id)
@@ -338,7 +338,7 @@ def test_running_again_is_a_new_job_with_the_same_inputs(jobs: Jobs, submit, inp
     assert b"".join(jobs.blobs.get(jobs.records.get(again.id).inputs).read()) == inputs_file.read_bytes()
     assert jobs.of("ann").get(again.id).id == again.id
     finish(jobs, again.id, inputs_file)
-    with pytest.raises(NotAllowedNow, match="has its result"):
+    with pytest.raises(NotAllowedNow, match="already has a result"):
         retry(jobs, again.id)
 
 
@@ -416,7 +416,7 @@ def test_a_retry_during_a_deletion_reports_an_unknown_job(jobs: Jobs, submit, mo
     assert jobs.records.deleted() == {}
 
 
-def test_jobs_count_the_uploads_and_the_quota_holds_at_the_moment_of_writing(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_uploads_count_against_the_quota_which_is_checked_on_writing(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     tight = dataclasses.replace(jobs, settings=dataclasses.replace(jobs.settings, disk_quota=4_000_000))
     uploads = Uploads.open(tight.settings)
     with uploads.write("big-one", offset=0, length=None, capacity=Capacity(max_bytes=10**7)) as writer:

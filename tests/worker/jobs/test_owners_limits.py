@@ -15,7 +15,7 @@ from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
 
 
-def test_the_limit_of_queued_jobs_holds(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_the_limit_of_queued_jobs_is_enforced_per_owner(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     ada, bob = (dataclasses.replace(jobs.of(owner), max_queued=2) for owner in ("ada", "bob"))
     first, _ = submit(ada), submit(ada, id="second", fingerprint="f")
     before = list(jobs.blobs.list("jobs/"))
@@ -58,14 +58,14 @@ def test_simultaneous_submissions_respect_the_limit(jobs: Jobs, submit) -> None:
     assert (ada.count([Status.QUEUED]), len(refused)) == (3, 9)
 
 
-def test_a_repeated_key_finds_its_job_though_the_queue_is_full(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_a_repeated_key_returns_its_job_even_if_the_queue_is_full(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     ada = dataclasses.replace(jobs.of("ada"), max_queued=1)
     job = submit(ada, idempotency_key="k", fingerprint="f")
     ada.check_capacity(idempotency_key="k")
     assert submit(ada, idempotency_key="k", fingerprint="f").id == job.id
 
 
-def test_a_job_over_its_owners_limit_is_noted_as_held_back_until_it_is_cancelled(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_a_job_over_the_running_limit_is_held_back_until_it_is_cancelled(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     ada = dataclasses.replace(jobs.of("ada"), max_running=1)
     first, second = submit(ada), submit(ada)
     assert jobs.queue.waiting() == [jobs.records.get(first.id).attempt_id]
@@ -74,7 +74,7 @@ def test_a_job_over_its_owners_limit_is_noted_as_held_back_until_it_is_cancelled
     assert jobs.queue.held() == set()
 
 
-def test_the_tokens_limit_of_running_jobs_is_stored_with_each_job(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_the_tokens_running_limit_is_stored_with_each_job(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     ids = [submit(dataclasses.replace(jobs.of("ada"), max_running=most)).id for most in (None, 0, 3)]
     beats = jobs.records.beats(ids)
     assert [(beats[id].owner, beats[id].max_running) for id in ids] == [("ada", None), ("ada", 0), ("ada", 3)]

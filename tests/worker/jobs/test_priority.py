@@ -15,7 +15,7 @@ def names(jobs: Jobs) -> list[str]:
     return [jobs.get(id).name for id in ids]
 
 
-def test_a_job_passes_only_its_owners_jobs(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_priority_overtakes_only_jobs_of_the_same_owner(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     ada, bob = jobs.of("ada"), jobs.of("bob")
     submit(ada, name="a1")
     submit(bob, name="b1")
@@ -29,13 +29,13 @@ def test_a_job_passes_only_its_owners_jobs(jobs: Jobs, submit) -> None:  # type:
     assert jobs.get(jobs.page(limit=1).jobs[0].id).priority == "high"
 
 
-def test_a_job_run_again_keeps_its_priority(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_a_retried_job_keeps_its_priority(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     first = submit(name="first", priority="high")
     jobs.cancel(first.id)
     assert retry(jobs, first.id).priority == "high"
 
 
-def test_ordering_what_is_not_there_changes_nothing(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_ordering_unknown_jobs_changes_nothing(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     submit(name="only")
     before = jobs.queue.waiting()
     jobs.queue.order({"somebody-else": 0})
@@ -43,14 +43,14 @@ def test_ordering_what_is_not_there_changes_nothing(jobs: Jobs, submit) -> None:
     assert jobs.queue.waiting() == before
 
 
-def test_held_back_jobs_are_not_queued_by_their_priority(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_a_high_priority_does_not_lift_the_running_limit(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     ada = replace(jobs.of("ada"), max_running=1)
     submit(ada, name="a1")
     submit(ada, name="a2-high", priority="high")
     assert names(jobs) == ["a1"], "fairness between owners stays: one of hers at once"
 
 
-def test_a_job_of_a_lost_worker_passes_only_those_of_less_priority(tmp_path: Path, submit) -> None:  # type: ignore[no-untyped-def]
+def test_jobs_of_a_lost_worker_are_requeued_in_order_of_priority(tmp_path: Path, submit) -> None:  # type: ignore[no-untyped-def]
     world = World(tmp_path)
     lost = {name: submit(world.jobs, name=name, priority=name).id for name in ("low", "normal", "high")}  # type: ignore[arg-type]
     attempts = [world.claim(id) for id in lost.values()]
@@ -75,7 +75,7 @@ def test_a_lost_delivery_is_queued_by_its_priority(tmp_path: Path, submit) -> No
     assert names(world.jobs) == ["normal", "low"]
 
 
-def test_of_held_back_jobs_the_highest_priority_comes_first(tmp_path: Path, submit) -> None:  # type: ignore[no-untyped-def]
+def test_the_held_back_job_of_highest_priority_starts_first(tmp_path: Path, submit) -> None:  # type: ignore[no-untyped-def]
     world = World(tmp_path, max_running=1)
     first = submit(world.jobs, name="first")
     submit(world.jobs, name="second")

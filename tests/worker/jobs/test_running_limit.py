@@ -14,7 +14,7 @@ from worker_house import House, settled
 
 @pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
 @pytest.mark.slow
-def test_with_two_workers_the_running_limit_holds_and_all_jobs_finish(
+def test_two_workers_respect_the_running_limit_and_finish_all_jobs(
     settings: Settings, inputs_files: tuple[Path, Path]
 ) -> None:
     limited = dataclasses.replace(settings, workers=2, max_running=1, threads=1)

@@ -1,4 +1,4 @@
-"""Backups of an installation at work, restored where nothing was; and what is refused."""
+"""Backups of a running installation, restored into an empty one; and what is refused."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def jobs(settings: Settings) -> Jobs:
 
 @pytest.fixture
 def empty(settings: Settings, tmp_path: Path) -> Settings:
-    """Another machine, where nothing is yet."""
+    """Another machine, still empty."""
     return replace(settings, data=tmp_path / "elsewhere", queue=f"test-{secrets.token_hex(4)}")
 
 
@@ -85,7 +85,7 @@ def sent(jobs: Jobs, submit: Submit, tmp_path: Path) -> dict[str, str]:
     return ids
 
 
-def test_a_restored_installation_is_the_same(jobs: Jobs, sent: dict[str, str], empty: Settings, tmp_path: Path) -> None:
+def test_restore_recovers_the_installation(jobs: Jobs, sent: dict[str, str], empty: Settings, tmp_path: Path) -> None:
     made = write_backup(jobs.settings, tmp_path / "backup")
     assert (made.jobs, made.blobs, made.copied) == (5, 6, 6)
     assert restore_backup(empty, tmp_path / "backup").jobs == 5
@@ -105,7 +105,7 @@ def test_a_restored_installation_is_the_same(jobs: Jobs, sent: dict[str, str], e
     assert there.records.tallies()["ended:succeeded"] == 1
 
 
-def test_a_job_of_further_outputs_keeps_the_result_that_it_works_from(
+def test_a_further_outputs_job_keeps_its_source_result_in_a_backup(
     jobs: Jobs, submit: Submit, empty: Settings, tmp_path: Path
 ) -> None:
     solved = submit(name="done").id
@@ -121,9 +121,7 @@ def test_a_job_of_further_outputs_keeps_the_result_that_it_works_from(
     assert b"".join(there.blobs.get(key).read()) == b"the shapes"
 
 
-def test_what_a_webhook_owes_is_owed_after_the_restoration(
-    jobs: Jobs, sent: dict[str, str], empty: Settings, tmp_path: Path
-) -> None:
+def test_pending_webhooks_are_restored(jobs: Jobs, sent: dict[str, str], empty: Settings, tmp_path: Path) -> None:
     from pliant.worker.store.connection import connect
 
     write_backup(jobs.settings, tmp_path / "backup")
@@ -133,7 +131,7 @@ def test_what_a_webhook_owes_is_owed_after_the_restoration(
     client.close()
 
 
-def test_a_second_backup_copies_only_what_is_new_and_drops_what_is_gone(
+def test_a_second_backup_copies_new_files_and_drops_deleted_ones(
     jobs: Jobs, sent: dict[str, str], submit: Submit, tmp_path: Path
 ) -> None:
     backup = tmp_path / "backup"
@@ -147,7 +145,7 @@ def test_a_second_backup_copies_only_what_is_new_and_drops_what_is_gone(
     assert len(list(backup.glob("jobs-*"))) == len(list(backup.glob("rest-*"))) == 1
 
 
-def test_a_job_deleted_while_it_is_copied_is_left_out(
+def test_a_job_deleted_during_the_backup_is_omitted(
     jobs: Jobs, sent: dict[str, str], empty: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plain = Blobs.get
@@ -172,15 +170,15 @@ def backup(jobs: Jobs, sent: dict[str, str], tmp_path: Path) -> Path:
     return copy
 
 
-def test_what_is_no_backup_or_not_empty_is_refused(jobs: Jobs, backup: Path, empty: Settings, tmp_path: Path) -> None:
+def test_invalid_backups_and_targets_are_refused(jobs: Jobs, backup: Path, empty: Settings, tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letter.txt").write_text("Dear")
     for place in (tmp_path / "other", tmp_path / "other" / "letter.txt"):
-        with pytest.raises(BadBackup, match="no backup"):
+        with pytest.raises(BadBackup, match="is not a backup"):
             write_backup(jobs.settings, place)
     with pytest.raises(BadBackup, match=r"manifest\.json cannot be read"):
         restore_backup(empty, tmp_path / "other")
-    with pytest.raises(BadBackup, match="has jobs or tokens already"):
+    with pytest.raises(BadBackup, match="already has jobs or tokens"):
         restore_backup(jobs.settings, backup)
 
 

@@ -44,7 +44,7 @@ def digests(jobs: Jobs, id: str) -> dict[str, str]:
     return found
 
 
-def test_a_backup_under_load_is_restored_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_backup_under_load_is_restored_completely(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
     house_of = import_module("benchmarks.installation.instance").Instance
     sequence, stop = face(4, 60), threading.Event()

@@ -105,7 +105,7 @@ def test_every_kind_of_inconsistency_is_found(jobs: Jobs, submit: Callable[[], S
     jobs.blobs.delete(f"jobs/{done.job.id}/")
 
     for update, sentence in (
-        ({"finished_at": NOW}, "time of finishing"),
+        ({"finished_at": NOW}, "but finished_at is"),
         ({"error": Problem(title="t", status=500, detail="d.", code="c")}, "its error is"),
     ):
         sound = jobs.records.get(stored.job.id).job
@@ -128,7 +128,7 @@ def test_every_kind_of_inconsistency_is_found(jobs: Jobs, submit: Callable[[], S
     only("has lost its inputs")
 
 
-def test_a_change_in_progress_is_no_finding(
+def test_a_change_in_progress_is_not_reported(
     jobs: Jobs, submit: Callable[[], Stored], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stored = submit()

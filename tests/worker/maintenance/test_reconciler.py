@@ -69,7 +69,7 @@ def test_heartbeats_keep_a_job_running(world: World, submit: Callable[[World], s
     assert world.jobs.get(id).status is Status.RUNNING
 
 
-def test_neither_an_outage_nor_a_jumping_clock_loses_a_job(world: World, submit: Callable[[World], str]) -> None:
+def test_an_outage_or_a_clock_jump_loses_no_job(world: World, submit: Callable[[World], str]) -> None:
     id = submit(world)
     attempt_id = world.claim(id)
     world.pass_seconds(2)
@@ -82,9 +82,7 @@ def test_neither_an_outage_nor_a_jumping_clock_loses_a_job(world: World, submit:
     assert world.jobs.get(id).status is Status.RUNNING
 
 
-def test_a_queued_job_that_the_queue_does_not_hold_is_queued_again(
-    world: World, submit: Callable[[World], str]
-) -> None:
+def test_a_job_missing_from_the_queue_is_queued_again(world: World, submit: Callable[[World], str]) -> None:
     id, other = submit(world), submit(world)
     attempt_id = world.jobs.records.get(id).attempt_id
     world.jobs.queue.remove(attempt_id)
@@ -95,7 +93,7 @@ def test_a_queued_job_that_the_queue_does_not_hold_is_queued_again(
     )
 
 
-def test_only_what_has_expired_is_removed(world: World, submit: Callable[[World], str]) -> None:
+def test_only_expired_jobs_are_removed(world: World, submit: Callable[[World], str]) -> None:
     queued, running, early, late = (submit(world) for _ in range(4))
     attempt_id = world.claim(running)
     world.jobs.cancel(early)
@@ -120,7 +118,7 @@ def test_without_retention_nothing_expires(world: World, submit: Callable[[World
     assert world.jobs.get(id).status is Status.CANCELLED
 
 
-def test_files_of_no_job_are_removed_once_they_are_old(
+def test_files_that_belong_to_no_job_are_removed_once_old(
     world: World, submit: Callable[[World], str], tmp_path: Path
 ) -> None:
     file = tmp_path / "some-inputs.npz"
@@ -158,7 +156,7 @@ def test_scratch_directories_of_ended_attempts_are_removed(world: World, submit:
     assert [directory.exists() for directory in (running, over, just_over)] == [True, False, True]
 
 
-def test_what_a_killed_attempt_had_uploaded_is_removed(
+def test_files_stored_by_a_killed_attempt_are_removed(
     world: World, submit: Callable[[World], str], tmp_path: Path
 ) -> None:
     id = submit(world)
@@ -177,7 +175,7 @@ def test_what_a_killed_attempt_had_uploaded_is_removed(
     assert [key for key, _ in world.jobs.blobs.list("jobs/")] == [world.jobs.records.get(id).inputs]
 
 
-def test_what_an_attempt_had_uploaded_is_removed_when_its_worker_is_lost(
+def test_files_stored_by_an_attempt_are_removed_if_its_worker_is_lost(
     world: World, submit: Callable[[World], str], tmp_path: Path
 ) -> None:
     id = submit(world)
@@ -189,7 +187,7 @@ def test_what_an_attempt_had_uploaded_is_removed_when_its_worker_is_lost(
     assert findings(world.jobs, pause=0) == []
 
 
-def test_an_unavailable_store_is_waited_for(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reconciler_survives_an_unavailable_store(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
 
     def tick(self: Reconciler) -> None:
@@ -202,7 +200,7 @@ def test_an_unavailable_store_is_waited_for(world: World, monkeypatch: pytest.Mo
     assert len(calls) == 3
 
 
-def test_lost_time_counts_only_between_checks_of_the_same_heartbeat() -> None:
+def test_silent_time_counts_only_while_the_heartbeat_is_unchanged() -> None:
     still = Stillness()
     assert still.look({"a": 1}, 5.0) == {"a": 0.0}
     assert still.look({"a": 1, "b": 1}, 2.0) == {"a": 2.0, "b": 0.0}
@@ -211,7 +209,7 @@ def test_lost_time_counts_only_between_checks_of_the_same_heartbeat() -> None:
     assert still.look({"a": 2}, 1.0) == {"a": 0.0}
 
 
-def test_the_last_output_is_the_end_of_the_file(tmp_path: Path) -> None:
+def test_the_last_100_lines_of_output_are_read(tmp_path: Path) -> None:
     settings = Settings(data=tmp_path)
     assert last_words(settings, "t-1") == []
     directory = working_directory(settings, "t-1")
@@ -224,7 +222,7 @@ def test_the_last_output_is_the_end_of_the_file(tmp_path: Path) -> None:
     assert not directory.exists()
 
 
-def test_it_removes_uploads_that_have_expired(world: World) -> None:
+def test_expired_uploads_are_removed(world: World) -> None:
     uploads = Uploads.open(world.jobs.settings)
     for id in ("old", "young"):
         with uploads.write(id, offset=0, length=None, capacity=Capacity(max_bytes=9)) as writer:
@@ -238,7 +236,7 @@ def test_it_removes_uploads_that_have_expired(world: World) -> None:
 
 
 @pytest.mark.parametrize("jump", [timedelta(days=365), timedelta(days=-365)])
-def test_a_jump_of_the_clock_loses_nothing(
+def test_a_clock_jump_of_a_year_loses_nothing(
     world: World, jump: timedelta, inputs_file: Path, interpretation: Interpretation
 ) -> None:
     def submit() -> str:
@@ -259,7 +257,7 @@ def test_a_jump_of_the_clock_loses_nothing(
     assert (world.jobs.get(busy).status, world.jobs.get(busy).attempt) == (Status.RUNNING, 1)
     assert world.jobs.get(waiting).place_in_queue == 0
     assert findings(world.jobs, pause=0) == []
-    world.now -= jump  # put right
+    world.now -= jump  # corrected
     world.pass_seconds(3700, meanwhile=lambda: world.jobs.records.beat(busy, attempt_id))
     with pytest.raises(UnknownJob):
         world.jobs.get(done)
@@ -269,7 +267,7 @@ def test_a_jump_of_the_clock_loses_nothing(
 def test_files_stored_late_by_a_stale_attempt_are_removed(
     world: World, submit: Callable[[World], str], tmp_path: Path
 ) -> None:
-    """After Redis was cut off for 200 s the files of stale attempts stayed until the hourly sweep."""
+    """After 200 s without Redis, files of stale attempts used to stay until the hourly sweep."""
     id = submit(world)
     old = world.claim(id)
     world.pass_seconds(7)

@@ -1,7 +1,7 @@
 """Data of an older version is brought up to date when the first process starts; data of a newer one is refused.
 
-`tests/data/records_of_fafc6bb.json` holds the Redis keys of an installation that commit fafc6bb had made, the last one before the
-version of the records was stored: three jobs, one of them with a result, and a token. RQ's own entries are left out.
+`tests/data/records_of_fafc6bb.json` holds the Redis keys of an installation made by commit fafc6bb, the last one that stored
+records without their version: three jobs, one of them with a result, and a token. RQ's own entries are left out.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def bodies(settings: Settings) -> dict[str, dict[str, Any]]:
     return found
 
 
-def test_an_old_installation_goes_on_where_it_was(old: Settings) -> None:
+def test_an_old_installation_keeps_working_after_migration(old: Settings) -> None:
     assert all("schema" not in body for body in bodies(old).values())
     assert prepare(old) == 3
     assert {body["schema"] for body in bodies(old).values()} == {CURRENT}
@@ -81,7 +81,7 @@ def test_an_old_installation_goes_on_where_it_was(old: Settings) -> None:
     assert findings(jobs, pause=0) == []
 
 
-def test_a_backup_of_old_records_is_restored_too(old: Settings, tmp_path: Path) -> None:
+def test_a_backup_of_old_records_is_migrated_on_restore(old: Settings, tmp_path: Path) -> None:
     write_backup(old, tmp_path / "backup")
     new = Settings(data=tmp_path / "new", redis_url=old.redis_url, queue=f"{old.queue}-new")
     restore_backup(new, tmp_path / "backup")
@@ -89,7 +89,7 @@ def test_a_backup_of_old_records_is_restored_too(old: Settings, tmp_path: Path) 
     assert Jobs.open(new).get("old-done") == Jobs.open(old).get("old-done")
 
 
-def test_processes_that_start_at_once_migrate_once(old: Settings) -> None:
+def test_simultaneous_starts_migrate_only_once(old: Settings) -> None:
     counts: list[int] = []
     threads = [threading.Thread(target=lambda: counts.append(prepare(old))) for _ in range(4)]
     for each in threads:
@@ -116,6 +116,6 @@ def test_data_of_a_newer_version_is_refused_by_every_process(
         migrated({"schema": CURRENT + 1})
 
 
-def test_there_is_a_step_from_every_older_version() -> None:
+def test_there_is_a_migration_step_from_every_older_version() -> None:
     assert sorted(STEPS) == list(range(1, CURRENT))
     assert migrated({"version": 5}) == {"version": 5, "schema": CURRENT}

@@ -56,7 +56,7 @@ def test_ended_children_are_restarted_with_growing_pauses(tmp_path: Path) -> Non
 
     until(lambda: len(starts()) >= 4)
     first, second, third, fourth = starts()[:4]
-    # Each pause is twice the one before; what starting takes comes on top, in bounds that a busy machine widens.
+    # Each pause is twice the one before; starting the process takes extra time, more on a busy machine.
     for number, gap in enumerate((second - first, third - second, fourth - third), start=1):
         assert gap >= 2**number * FIRST_PAUSE
     assert fourth - first < 2 * 14 * FIRST_PAUSE + 10
@@ -66,7 +66,7 @@ def test_ended_children_are_restarted_with_growing_pauses(tmp_path: Path) -> Non
     assert gone(steady)
 
 
-def test_children_stop_before_their_dependencies_and_are_killed_after_the_grace_period(tmp_path: Path) -> None:
+def test_children_stop_before_foundations_and_are_killed_after_their_grace(tmp_path: Path) -> None:
     log = tmp_path / "ends"
     polite = (
         "import signal, sys, time\n"
@@ -123,7 +123,7 @@ def test_a_signal_stops_everything(number: signal.Signals) -> None:
     assert gone(child)
 
 
-def test_a_second_signal_stops_the_waiting() -> None:
+def test_a_second_signal_kills_children_without_waiting() -> None:
     deaf = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(600)"
     process = subprocess.Popen([sys.executable, "-c", SUPERVISED.format(code=deaf)], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -138,7 +138,7 @@ def test_a_second_signal_stops_the_waiting() -> None:
     assert gone(child)
 
 
-def test_a_signal_while_starting_stops_what_was_started() -> None:
+def test_a_signal_during_start_stops_the_started_children() -> None:
     waiting = SUPERVISED.replace(
         "grace=60.0", "grace=60.0, ready=lambda c: (print(c.pid, flush=True), time.sleep(600))"
     )
@@ -186,7 +186,7 @@ def test_two_supervisors_on_one_directory_are_refused(tmp_path: Path) -> None:
     Valkey.claim(tmp_path).release()
 
 
-def test_a_server_that_outlived_its_supervisor_is_taken_over_with_its_data(tmp_path: Path) -> None:
+def test_an_orphaned_server_is_stopped_and_its_data_is_kept(tmp_path: Path) -> None:
     first = Valkey.claim(tmp_path)
     orphan = first.start()
     client = connect(Settings(data=tmp_path).redis, decode=True)
@@ -206,7 +206,7 @@ def test_a_server_that_outlived_its_supervisor_is_taken_over_with_its_data(tmp_p
     second.release()
 
 
-def test_a_server_that_does_not_stop_keeps_its_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_does_not_stop_blocks_its_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(valkey_module, "STOPS_WITHIN", 0.3)
     first = Valkey.claim(tmp_path)
     holder = subprocess.Popen([sys.executable, "-S", "-c", SLEEP], pass_fds=(first.server_lock,))
@@ -218,7 +218,7 @@ def test_a_server_that_does_not_stop_keeps_its_directory(tmp_path: Path, monkeyp
     Valkey.claim(tmp_path).release()
 
 
-def test_a_damaged_log_is_shown(tmp_path: Path) -> None:
+def test_a_damaged_append_only_file_is_reported(tmp_path: Path) -> None:
     first = Valkey.claim(tmp_path)
     server = first.start()
     client = connect(Settings(data=tmp_path).redis, decode=True)
@@ -277,7 +277,7 @@ def test_a_socket_directory_that_is_a_link_is_refused(tmp_path: Path) -> None:
         directory.unlink()
 
 
-def test_a_data_directory_is_its_owners_alone(tmp_path: Path) -> None:
+def test_the_data_directory_is_private_to_its_owner(tmp_path: Path) -> None:
     data = tmp_path / "data"
     make_data_directory(data)
     shared = tmp_path / "shared"

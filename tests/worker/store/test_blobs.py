@@ -56,7 +56,7 @@ def test_a_range_outside_the_file_is_refused(file: Path, start: int, end: int | 
         next(blobs.get("k").read(start, end))
 
 
-def test_listing_copying_and_deleting(blobs: Blobs, file: Path) -> None:
+def test_files_are_listed_copied_and_deleted(blobs: Blobs, file: Path) -> None:
     for key in ("jobs/a/t/inputs.npz", "jobs/a/u/shapes.npz", "jobs/ab/t/inputs.npz"):
         blobs.put(key, file)
     blobs.copy("jobs/a/t/inputs.npz", "jobs/c/t/inputs.npz")
@@ -72,7 +72,7 @@ def test_listing_copying_and_deleting(blobs: Blobs, file: Path) -> None:
     blobs.check()
 
 
-def test_a_missing_file_is_missing(blobs: Blobs, tmp_path: Path) -> None:
+def test_missing_files_raise_file_not_found(blobs: Blobs, tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         blobs.get("jobs/nobody")
     with pytest.raises(FileNotFoundError):
@@ -101,7 +101,7 @@ def test_an_unavailable_store_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_p
 
 @pytest.mark.skipif(not Path("/proc/self/io").exists(), reason="reads /proc")
 def test_a_local_store_links_instead_of_copying(tmp_path: Path) -> None:
-    """Inputs went from the spool to the store and to the scratch directory as three copies; now they are one file."""
+    """Spool, store and scratch directory share one file of inputs instead of holding three copies."""
     canonical = tmp_path / "canonical.npz"
     canonical.write_bytes(bytes(8_000_000))
     blobs = Blobs.open((tmp_path / "store").as_uri())
@@ -149,7 +149,7 @@ def test_hanging_calls_end_at_their_time_limit_and_further_ones_fail_at_once() -
     began = time.monotonic()
     with pytest.raises(StoreUnavailable, match="too many requests"):
         calls.run(go_on.wait, seconds=10)
-    assert time.monotonic() - began < 0.7  # those that hang still do
+    assert time.monotonic() - began < 0.7  # the hanging calls still hang
     for each in hanging:
         each.join()
     go_on.set()
@@ -157,7 +157,7 @@ def test_hanging_calls_end_at_their_time_limit_and_further_ones_fail_at_once() -
 
 
 @pytest.mark.slow
-def test_a_store_that_accepts_connections_without_replying(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
+def test_a_store_that_never_replies_is_unavailable(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         for name, value in {
             "AWS_ENDPOINT_URL": f"http://127.0.0.1:{silent.getsockname()[1]}", "AWS_ALLOW_HTTP": "true",
@@ -177,7 +177,7 @@ def test_a_store_that_accepts_connections_without_replying(monkeypatch: pytest.M
             assert "127.0.0.1" not in str(problem)
 
 
-def test_every_variable_about_the_store_is_documented() -> None:
+def test_every_store_variable_is_documented() -> None:
     page = (Path(__file__).parents[3] / "docs" / "how-to" / "s3.md").read_text()
     credentials = ("access_key_id", "secret_access_key", "session_token", "region", "endpoint_url", "ca_bundle")
     for name in (*SWITCHES, *TEXTS, *credentials):
@@ -190,8 +190,8 @@ def written() -> int:
     return int(counters["wchar"])
 
 
-def test_variables_about_the_connection_reach_the_store(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """obstore reads no `AWS_` variable about the connection beside options that it is given, so each is passed on."""
+def test_connection_variables_are_passed_to_the_store(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """obstore ignores `AWS_` variables about the connection once it is given options, so each is passed on."""
     bundle = tmp_path / "ca.pem"
     bundle.write_text("a certificate")
     variables = {

@@ -1,4 +1,4 @@
-"""Faults of the store's server become one error; faults of commands stay what they are."""
+"""Faults of the store's server become one error; errors of commands pass through unchanged."""
 
 from __future__ import annotations
 
@@ -24,6 +24,6 @@ def test_a_server_that_cannot_serve_is_unavailable(fault: redis.RedisError, reas
         raise fault
 
 
-def test_the_error_of_a_command_passes() -> None:
+def test_command_errors_pass_through_unchanged() -> None:
     with pytest.raises(redis.ResponseError, match="WRONGTYPE"), reachable():
         raise redis.ResponseError("WRONGTYPE of a key")

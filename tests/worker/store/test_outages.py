@@ -38,18 +38,18 @@ def test_a_job_survives_an_outage_of_the_store(tmp_path: Path, inputs_files: tup
         time.sleep(3.5)
         os.kill(server, signal.SIGCONT)
         before = house.jobs.get(id).progress
-        house.until(lambda: house.jobs.get(id).progress != before, "it goes on telling")
+        house.until(lambda: house.jobs.get(id).progress != before, "it keeps reporting progress")
         assert (house.jobs.get(id).attempt, house.job_processes()) == (1, [job_process])
         os.kill(server, signal.SIGKILL)
         house.until(lambda: house.supervisor.pids().get("valkey", server) != server, "it is started again")
-        house.until(lambda: house.jobs.get(id).progress != before, "it goes on telling")
+        house.until(lambda: house.jobs.get(id).progress != before, "it keeps reporting progress")
         assert (house.jobs.get(id).attempt, house.job_processes()) == (1, [job_process])
         house.jobs.cancel(id)
         assert house.final(id).status is Status.CANCELLED
         settled(house)
 
 
-def test_killing_valkey_loses_nothing(tmp_path: Path, inputs_files: tuple[Path, Path]) -> None:
+def test_killing_valkey_loses_no_job(tmp_path: Path, inputs_files: tuple[Path, Path]) -> None:
     settings = Settings(data=tmp_path, workers=2, threads=1)
     with House(settings, own_valkey=True, inputs=inputs_files) as house:
         ids = [house.submit() for _ in range(5)]
@@ -117,7 +117,7 @@ supervisor.run(on_started=lambda: print(*supervisor.pids().values(), flush=True)
 
 
 @pytest.mark.slow
-def test_killing_the_supervisor_kills_all_and_loses_nothing(tmp_path: Path, inputs_files: tuple[Path, Path]) -> None:
+def test_killing_the_supervisor_ends_all_and_loses_no_job(tmp_path: Path, inputs_files: tuple[Path, Path]) -> None:
     settings = Settings(data=tmp_path, workers=1, threads=1, lost_after=2.0, stop_grace=1.0)
     env = {**os.environ, **settings.to_environment()}
     process = subprocess.Popen([sys.executable, "-c", SUPERVISOR], env=env, stdout=subprocess.PIPE, text=True)
@@ -175,7 +175,7 @@ def test_a_full_blob_store_refuses_the_job_and_keeps_nothing(
         assert findings(house.jobs, pause=0) == []
 
 
-def test_a_full_disk_under_valkey_refuses_and_loses_nothing(
+def test_valkey_on_a_full_disk_refuses_jobs_and_loses_none(
     small_disk: Path, tmp_path: Path, inputs_files: tuple[Path, Path]
 ) -> None:
     settings = Settings(data=small_disk, blob_url=(tmp_path / "blobs").as_uri(), threads=1)

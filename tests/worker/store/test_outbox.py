@@ -52,7 +52,7 @@ class Receiver:
         self.got: list[tuple[str, dict[str, str], bytes]] = []
         self.answers: list[int] = []
         self.open = threading.Event()
-        """Cleared, it takes what comes and answers nothing."""
+        """While it is cleared, requests are accepted but not answered."""
         self.open.set()
         receiver = self
 
@@ -102,7 +102,7 @@ Made = Callable[..., Job]
 
 @pytest.fixture
 def made(door: Jobs, inputs_file: Path, interpretation: Interpretation) -> Made:
-    """Submit a job and cancel it at once: it has ended, and its end is owed."""
+    """Submit a job and cancel it at once, so that its webhook is pending."""
 
     def call(url: str, *, end: bool = True, owner: str | None = None) -> Job:
         hook = Webhook(url=url, secret=SECRET)
@@ -116,7 +116,7 @@ def made(door: Jobs, inputs_file: Path, interpretation: Interpretation) -> Made:
 
 @pytest.fixture
 def webhook_sender(door: Jobs) -> Iterator[WebhookSender]:
-    """One with short pauses; started by the test."""
+    """A sender with short pauses; the test starts it."""
     carrier = WebhookSender.open(door.settings, door.records)
     carrier.pauses = (0.05, 0.05)
     yield carrier
@@ -178,17 +178,17 @@ def test_a_failed_delivery_is_repeated_with_the_same_id(
     assert "(attempt 3)" in log
 
 
-def test_after_the_last_attempt_or_a_410_it_is_given_up(
+def test_delivery_is_abandoned_after_the_last_attempt_or_a_410(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     receiver.answers = [500, 500, 500]
     job = made(receiver.url)
     webhook_sender.start()
     until(lambda: pending(webhook_sender.outbox) == 0)
-    until(lambda: "given up: the receiver returned 500 (attempt 3, the last one)." in door.log(job.id))
+    until(lambda: "abandoned: the receiver returned 500 (attempt 3, the last one)." in door.log(job.id))
     receiver.answers = [410]
     other = made(receiver.url)
-    until(lambda: "given up: the receiver returned 410" in door.log(other.id))
+    until(lambda: "abandoned: the receiver returned 410" in door.log(other.id))
     assert len(receiver.got) == 4
     until(lambda: door.records.tallies()["webhooks:given_up"] == 2)  # after the log
     assert door.records.tallies()["webhooks:tried"] == 4
@@ -211,10 +211,10 @@ def test_an_invalid_host_name_counts_as_a_failed_attempt(
     bad, good = made(f"http://{name}/"), made(receiver.url)
     webhook_sender.start()
     until(lambda: "Webhook delivered" in door.log(good.id))
-    until(lambda: "given up" in door.log(bad.id), seconds=30)
+    until(lambda: "abandoned" in door.log(bad.id), seconds=30)
 
 
-def test_a_name_of_an_internal_address_is_given_up_without_connecting(
+def test_a_host_with_an_internal_address_is_abandoned_without_connecting(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     webhook_sender.networks = ""
@@ -230,10 +230,10 @@ def test_a_name_of_an_internal_address_is_given_up_without_connecting(
     assert receiver.got == []
 
 
-def test_the_name_is_looked_up_once_and_the_connection_goes_to_what_was_found(
+def test_the_host_is_resolved_once_and_that_address_is_connected(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
-    """DNS rebinding: an answer that is good when it is checked, and another one when it is used."""
+    """DNS rebinding: an allowed address when it is checked, another one when it is used."""
     asked: list[str] = []
 
     def rebinding(host: str, port: int) -> list[ipaddress.IPv4Address | ipaddress.IPv6Address]:
@@ -252,7 +252,7 @@ def test_the_name_is_looked_up_once_and_the_connection_goes_to_what_was_found(
 
 @pytest.fixture
 def certificate(receiver: Receiver, tmp_path: Path) -> Path:
-    """A certificate for right.example that nobody knows; the receiver has it."""
+    """A self-signed certificate for right.example, which the receiver uses."""
     if shutil.which("openssl") is None:
         pytest.skip("needs the command openssl to make a certificate")
     pem = tmp_path / "both.pem"
@@ -275,17 +275,17 @@ def test_the_certificate_must_match_the_host_name(
     right, wrong = (made(f"https://{name}.example:{receiver.port}/") for name in ("right", "wrong"))
     webhook_sender.start()
     until(lambda: "Webhook delivered" in door.log(right.id))
-    until(lambda: "given up: ConnectError" in door.log(wrong.id))
+    until(lambda: "abandoned: ConnectError" in door.log(wrong.id))
     webhook_sender.trusted = trusted_by_default()
     stranger = made(f"https://right.example:{receiver.port}/")
-    until(lambda: "given up: ConnectError" in door.log(stranger.id))
+    until(lambda: "abandoned: ConnectError" in door.log(stranger.id))
     assert len(receiver.got) == 1
 
 
-def test_an_authority_that_the_system_trusts_is_trusted(
+def test_certificate_authorities_of_the_system_are_trusted(
     door: Jobs, made: Made, receiver: Receiver, certificate: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A company's own, say. Public ones are trusted as well, also where the system has no list of them."""
+    """Such as a company's own. Public ones are trusted too, even if the system has no list of them."""
     monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
     carrier = WebhookSender.open(door.settings, door.records)
     carrier.resolve = lambda host, port: [ipaddress.ip_address("127.0.0.1")]
@@ -299,7 +299,7 @@ def test_an_authority_that_the_system_trusts_is_trusted(
     assert others == len(httpx.create_ssl_context(trust_env=False).get_ca_certs())
 
 
-def test_a_proxy_of_the_environment_is_not_used(
+def test_proxy_variables_are_ignored(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("http_proxy", "HTTP_PROXY", "ALL_PROXY"):
@@ -334,7 +334,7 @@ def test_a_slow_receiver_delays_no_other_messages(
         slow.server.server_close()
 
 
-def test_a_name_that_is_looked_up_for_long_delays_no_other_messages(
+def test_a_slow_name_lookup_delays_no_other_messages(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     asked: list[str] = []
@@ -359,7 +359,7 @@ def test_a_name_that_is_looked_up_for_long_delays_no_other_messages(
         answered.set()
 
 
-def test_what_is_not_busy_any_more_is_not_counted() -> None:
+def test_releasing_removes_counters_that_reach_zero() -> None:
     busy = collections.Counter({"receiver a": 1, "owner b": 2})
     _release(busy, ["receiver a", "owner b"], None)  # type: ignore[arg-type]
     assert dict(busy) == {"owner b": 1}
@@ -388,7 +388,7 @@ def test_a_message_survives_a_sender_killed_while_sending_it(
     assert len(receiver.got) == 1
 
 
-def test_a_message_that_always_kills_its_sender_is_given_up(
+def test_a_message_that_always_kills_its_sender_is_abandoned(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     job = made(receiver.url)
@@ -408,7 +408,7 @@ def test_a_deleted_job_sends_nothing(door: Jobs, made: Made, receiver: Receiver,
     assert pending(outbox) == 0, "nor does a try that was under way bring it back"
 
 
-def test_a_retried_job_sends_its_webhook_and_one_without_does_not(
+def test_a_retried_job_sends_its_webhook_and_a_job_without_one_does_not(
     door: Jobs,
     made: Made,
     receiver: Receiver,
@@ -426,6 +426,6 @@ def test_a_retried_job_sends_its_webhook_and_one_without_does_not(
     assert {headers["webhook-id"] for _, headers, _ in receiver.got} == {f"msg_{again.id}", f"msg_{again.retry_of}"}
 
 
-def test_the_pauses_grow_and_sum_to_a_day() -> None:
+def test_retry_pauses_increase_and_sum_to_about_a_day() -> None:
     assert list(PAUSES) == sorted(PAUSES)
     assert 20 * 3600 < sum(PAUSES) < 28 * 3600

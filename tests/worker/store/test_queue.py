@@ -24,7 +24,7 @@ def test_the_queue_marks_held_back_jobs(jobs: Jobs) -> None:
 
 
 def test_a_delivery_being_dropped_by_a_worker_can_be_removed(settings: Settings) -> None:
-    """Between listing what a delivery's workers noted and reading it, the note may be gone."""
+    """An execution entry of a delivery may vanish between listing and reading it."""
     raw = connect(settings.redis, decode=False)
     queue = RedisQueue(raw, name=settings.queue)
     queue.push("job", "job-1")

@@ -38,13 +38,13 @@ def waiting(server: SilentServer, number: int, pool: ThreadPoolExecutor, end: th
         assert begun.acquire(timeout=20)
 
 
-def test_a_silent_server_gets_a_few_probes_and_one_a_second() -> None:
+def test_a_silent_server_gets_a_few_probes_then_one_per_second() -> None:
     clock, end = Clock(), threading.Event()
     server = SilentServer(clock=clock)
     with ThreadPoolExecutor(PROBES + 1) as pool:
         waiting(server, PROBES, pool, end)
         with server.call():
-            pass  # they may be slow, the server is not
+            pass  # commands that are slow do not make the server silent
         clock.now += SILENT_AFTER + 0.1
         waiting(server, 1, pool, end)  # a probe: none was sent for a second
         with pytest.raises(redis.TimeoutError, match="does not answer"), server.call():
@@ -66,10 +66,10 @@ def test_a_silent_server_gets_a_few_probes_and_one_a_second() -> None:
     with pytest.raises(redis.TimeoutError):
         fail()
     with server.call():
-        pass  # nothing waits, so it is tried again
+        pass  # no command is waiting, so the server is tried again
 
 
-def test_more_commands_than_may_wait_are_refused_after_their_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_above_the_limit_are_refused_after_a_short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pliant.worker.store.calls.TURN", 0.05)
     server, end = SilentServer(clock=Clock()), threading.Event()
     monkeypatch.setattr(server._room, "wait", lambda left: setattr(server.clock, "now", server.clock.now + left))
@@ -82,14 +82,14 @@ def test_more_commands_than_may_wait_are_refused_after_their_turn(monkeypatch: p
         pass
 
 
-def test_an_error_of_a_command_is_an_answer() -> None:
+def test_a_command_error_counts_as_an_answer() -> None:
     server = SilentServer()
     with pytest.raises(redis.ResponseError), server.call():
         raise redis.ResponseError("WRONGTYPE")
     assert not server._is_silent()
 
 
-def test_commands_and_pipelines_of_all_clients_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silence_is_shared_by_all_clients_and_pipelines(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "ANSWER_WITHIN", 0.2)
     monkeypatch.setattr("pliant.worker.store.calls.SILENT_AFTER", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
@@ -110,7 +110,7 @@ def test_commands_and_pipelines_of_all_clients_count(monkeypatch: pytest.MonkeyP
         raw.close()
 
 
-def test_an_answer_that_comes_at_the_last_moment_lets_others_through() -> None:
+def test_a_last_moment_answer_lets_other_commands_through() -> None:
     clock, end = Clock(), threading.Event()
     server = SilentServer(clock=clock)
     with ThreadPoolExecutor(PROBES) as pool:
@@ -120,7 +120,7 @@ def test_an_answer_that_comes_at_the_last_moment_lets_others_through() -> None:
         look = server._room.wait
 
         def answered(seconds: float) -> bool:
-            server._answered = clock.now  # as the thread does that reads it
+            server._answered = clock.now  # as the thread that reads the answer does
             return look(0)
 
         server._room.wait = answered  # type: ignore[assignment]

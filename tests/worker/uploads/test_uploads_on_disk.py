@@ -57,7 +57,7 @@ def test_an_upload_in_pieces_equals_the_file(
     assert (folder / "taken").read_bytes() == data
 
 
-def test_incomplete_uploads_cannot_be_used_and_complete_ones_not_be_written(uploads: Uploads, tmp_path: Path) -> None:
+def test_incomplete_uploads_cannot_be_used_nor_complete_ones_written(uploads: Uploads, tmp_path: Path) -> None:
     send(uploads, "one", b"half", finish=False)
     assert (uploads.get("one").complete, uploads.get("one").sha256) == (False, None)
     with pytest.raises(errors.Conflict, match="not complete yet") as caught:
@@ -91,7 +91,7 @@ def test_a_wrong_offset_is_rejected_and_restarting_is_allowed(uploads: Uploads) 
     assert uploads.get("one").offset == 3
 
 
-def test_the_length_holds_over_requests(uploads: Uploads) -> None:
+def test_the_declared_length_is_enforced_across_requests(uploads: Uploads) -> None:
     send(uploads, "one", b"half", finish=False, length=6)
     assert uploads.get("one").length == 6
     for data, length in ((b"x", 7), (b"xyz", None), (b"x", None)):
@@ -103,7 +103,7 @@ def test_the_length_holds_over_requests(uploads: Uploads) -> None:
     assert uploads.get("one").complete
 
 
-def test_a_piece_that_exceeds_the_length_is_not_written_and_those_before_it_stay(uploads: Uploads) -> None:
+def test_a_piece_beyond_the_length_is_dropped_and_earlier_ones_are_kept(uploads: Uploads) -> None:
     with uploads.write("one", offset=0, length=6, capacity=CAPACITY) as writer:
         writer.write(b"half")
         with pytest.raises(errors.InvalidRequest) as caught:
@@ -134,7 +134,7 @@ def test_uploads_with_another_digest_are_removed(uploads: Uploads) -> None:
     assert uploads.find("one") is None
 
 
-def test_odd_ids_and_too_many_are_refused(uploads: Uploads) -> None:
+def test_invalid_ids_and_too_many_uploads_are_refused(uploads: Uploads) -> None:
     for id in ("..", "a/b", "x", "a" * 65, ""):
         with pytest.raises(errors.InvalidRequest):
             send(uploads, id, b"")
@@ -156,7 +156,7 @@ def test_owners_do_not_see_each_other(uploads: Uploads, tmp_path: Path) -> None:
     yours.take("one", tmp_path / "taken")
 
 
-def test_two_processes_do_not_write_to_one_upload(uploads: Uploads) -> None:
+def test_two_processes_cannot_write_to_one_upload(uploads: Uploads) -> None:
     code = (
         "import sys; from pathlib import Path; from pliant.worker.uploads.service import Capacity, Uploads\n"
         "with Uploads(directory=Path(sys.argv[1]), expiry=0).write('one', offset=0, length=None, capacity=Capacity(max_bytes=9)) as w:\n"
@@ -207,13 +207,13 @@ def test_fsck_finds_inconsistent_uploads(uploads: Uploads) -> None:
     ]
     (part,) = uploads.directory.glob("*/part/part")
     (part.parent / "stray").touch()
-    assert list(uploads.findings(now())) == ["Upload part holds length, part, stray, not one file."]
+    assert list(uploads.findings(now())) == ["Upload part holds length, part, stray; expected exactly one file."]
     for path in part.parent.iterdir():
         path.unlink()
-    assert list(uploads.findings(now())) == ["Upload part holds nothing, not one file."]
+    assert list(uploads.findings(now())) == ["Upload part holds nothing; expected exactly one file."]
 
 
-def test_on_a_full_disk_the_bytes_of_the_request_are_removed(small_disk: Path) -> None:
+def test_a_request_that_fills_the_disk_is_rolled_back(small_disk: Path) -> None:
     uploads, room = Uploads(directory=small_disk / "uploads", expiry=0), Capacity(max_bytes=2**30)
     with pytest.raises(OSError, match="No space"):
         send(uploads, "announced", b"", length=4_000_000, capacity=room)
@@ -227,7 +227,7 @@ def test_on_a_full_disk_the_bytes_of_the_request_are_removed(small_disk: Path) -
     assert uploads.get("one").sha256 == hashlib.sha256(b"x" * 1_000_000 + b"z" * 1_000_000).hexdigest()
 
 
-def test_a_file_system_without_links_gets_a_copy(
+def test_uploads_are_copied_if_the_file_system_has_no_links(
     uploads: Uploads, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     send(uploads, "one", b"abc")
@@ -283,8 +283,8 @@ def test_a_reservation_ends_with_its_process(uploads: Uploads) -> None:
     assert list(uploads.findings(now())) == []
 
 
-def test_a_byte_more_does_not_read_what_is_there(uploads: Uploads, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each small PATCH used to read the whole upload again: a third of a second of processor time on 400 MB."""
+def test_appending_does_not_reread_the_upload(uploads: Uploads, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each small PATCH used to reread the whole upload: a third of a second of processor time for 400 MB."""
     read: list[int] = []
     whole = hashlib.file_digest
 

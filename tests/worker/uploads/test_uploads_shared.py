@@ -33,7 +33,7 @@ def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def hosts(settings: Settings, tmp_path: Path) -> list[SharedUploads]:
-    """The uploads as two API processes open them: each has connections of its own, and nothing on disk is common."""
+    """Uploads as opened by two API processes: each has its own connections, and they share no disk."""
     blobs = Blobs.open("memory:///")
     return [
         SharedUploads(
@@ -114,7 +114,7 @@ def test_the_newest_request_wins(hosts: list[SharedUploads]) -> None:
     assert two.find("gone") is None
 
 
-def test_two_that_begin_at_once_do_not_mix(hosts: list[SharedUploads], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simultaneous_starts_do_not_mix_uploads(hosts: list[SharedUploads], monkeypatch: pytest.MonkeyPatch) -> None:
     one, two = hosts
     send(one, "again", DATA[:200], finish=False)
     before = one.states.get(one.name("again"))
@@ -137,7 +137,7 @@ def test_unknown_uploads_are_errors(hosts: list[SharedUploads], tmp_path: Path) 
             act()
 
 
-def test_space_that_another_request_counts_for_long_is_unavailable(
+def test_a_long_held_space_lock_makes_the_store_unavailable(
     hosts: list[SharedUploads], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one, two = hosts
@@ -171,7 +171,7 @@ def test_wrong_offsets_lengths_and_digests_are_refused(hosts: list[SharedUploads
             send(one, bad, b"x")
 
 
-def test_limits_hold_over_all_processes(hosts: list[SharedUploads]) -> None:
+def test_limits_apply_across_all_processes(hosts: list[SharedUploads]) -> None:
     one, two = hosts
     with pytest.raises(errors.UploadTooLarge):
         send(one, "large", bytes(1001))
@@ -218,7 +218,7 @@ def test_unused_uploads_expire_and_stray_pieces_are_removed(hosts: list[SharedUp
 
 
 @pytest.mark.s3
-def test_where_files_are_in_s3_uploads_are_shared(settings: Settings, s3_url: str, tmp_path: Path) -> None:
+def test_uploads_are_shared_if_files_are_stored_in_s3(settings: Settings, s3_url: str, tmp_path: Path) -> None:
     on_s3 = replace(settings, blob_url=f"{s3_url}-{secrets.token_hex(3)}")
     jobs = Jobs.open(on_s3)
     uploads = open_uploads(on_s3, jobs.blobs)

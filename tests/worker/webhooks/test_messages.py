@@ -41,7 +41,7 @@ def test_public_addresses_are_allowed(address: str) -> None:
     assert may_reach(ipaddress.ip_address(address))
 
 
-def test_only_the_allowed_network_is_allowed() -> None:
+def test_only_the_configured_private_networks_are_allowed() -> None:
     for address, networks, reached in (
         ("10.1.2.3", "10.0.0.0/8", True),
         ("11.1.2.3", "12.0.0.0/8", True),
@@ -93,7 +93,7 @@ def test_a_secret_without_a_url_is_rejected() -> None:
     assert (webhook.url, webhook.secret) == ("https://example.org:8443/a?b=c", SECRET)
 
 
-def test_the_signature_is_the_schemes_own_example() -> None:
+def test_the_signature_matches_the_example_of_the_specification() -> None:
     """The example of the specification's reference libraries."""
     headers = signed(
         "whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw",

@@ -21,7 +21,7 @@ def available() -> bool:
 
 
 def write_alembic(result: Result, file: IO[bytes], on_progress: Callable[[float], None]) -> None:
-    """Write `/NAME/mesh` (`/NAME/points` without faces) with a time sample a frame; y up, right-handed, as in the glTF file.
+    """Write `/NAME/mesh` (`/NAME/points` without faces) with a time sample per frame; y up, right-handed, as in the glTF file.
 
     The library requires a path, so a temporary file beside the target is used. The archive has no date: equal results give
     equal files.
@@ -34,8 +34,8 @@ def _build(path: Path, result: Result, on_progress: Callable[[float], None]) -> 
     from alembic3d import Abc, AbcCoreAbstract, AbcGeom
 
     # The archive is written to disk when the last of its objects is released, at the end of this function.
-    archive = Abc.OArchive(str(path), True)  # True: the Ogawa format, which all current readers have
-    # By its index: a TimeSampling handed to a schema is not kept alive by the binding.
+    archive = Abc.OArchive(str(path), True)  # True: the Ogawa format, which all current readers support
+    # Referred to by index, because the binding does not keep a TimeSampling alive.
     sampling = archive.addTimeSampling(AbcCoreAbstract.TimeSampling(1 / result.options.fps, 0.0))
     stand = AbcGeom.OXform(archive.getTop(), identifier(result.name))
     scale, placed = AbcGeom.XformOp(AbcGeom.XformOperationType.kScaleOperation, 0), AbcGeom.XformSample()
@@ -49,7 +49,7 @@ def _build(path: Path, result: Result, on_progress: Callable[[float], None]) -> 
 
 
 def _mesh_writer(parent: Any, sampling: int, result: Result) -> Callable[[Any], None]:
-    """Return what writes the points of a frame; faces and texture coordinates are written once, with the first frame."""
+    """Return a function that writes the points of a frame; faces and texture coordinates are written once, with the first frame."""
     import imath
     from alembic3d import AbcGeom
 
@@ -68,7 +68,7 @@ def _mesh_writer(parent: Any, sampling: int, result: Result) -> Callable[[Any], 
         if result.texture is not None:
             places = np.column_stack([result.texture.uv[:, 0], 1 - result.texture.uv[:, 1]]).astype(np.float32)
             array = imath.V2fArrayFromBuffer(np.ascontiguousarray(places))
-            # One value for each corner of a face, through an index: the form that every reader knows.
+            # One indexed value for each corner of a face: the form that every reader supports.
             corners = imath.UnsignedIntArray(faces.size)
             for number, index in enumerate(faces.reshape(-1).tolist()):
                 corners[number] = index

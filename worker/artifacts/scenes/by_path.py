@@ -1,4 +1,4 @@
-"""Output of libraries that write to a path of their own instead of an open file."""
+"""Output of libraries that write to a path instead of an open file."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ PICTURE = "texture.jpg"
 """Name of the texture in the package."""
 
 PACKED_AT = 315_619_200
-"""Time stamp of the package's files, seconds since 1970 (2 January 1980, which ZIP can state): equal results are equal files."""
+"""Time stamp of the package's files, seconds since 1970 (2 January 1980, which ZIP can represent); makes equal results equal files."""
 
 
 def available() -> bool:

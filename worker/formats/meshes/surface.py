@@ -1,4 +1,4 @@
-"""The mesh of a job: a file, a grid size, a mask of the picture, or the picture itself; vertex i is point i."""
+"""The mesh of a job: a file, a grid size, a mask of the picture, or the picture's pixel grid; vertex i is point i."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def read_surface(
 ) -> Surface:
     """Read the form part `mesh`: a file, ROWSxCOLUMNS or `none`.
 
-    None: the grid of the picture whose pixels the points are, else a generated mesh.
+    For None, the mesh is the pixel grid if the points are the pixels of a picture; otherwise it is generated later.
 
     Raises
     ------
@@ -116,6 +116,6 @@ def whole_grid(surface: Surface) -> tuple[int, int] | None:
 
 
 def number_cells(mask: NDArray[np.generic]) -> NDArray[np.int64]:
-    """Give the marked cells of a picture their numbers, row by row, −1 elsewhere."""
+    """Return the numbers of the marked cells of a picture, row by row; −1 elsewhere."""
     marked = np.asarray(mask) != 0
     return np.where(marked, np.cumsum(marked).reshape(marked.shape) - 1, -1)

@@ -40,7 +40,7 @@ UNREADABLE_ZIP = (
 
 TRACK_FILES = "npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe exports"
 MESH_FILES = "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"
-"""What is read, in the words of refusals."""
+"""Supported files, as named in error messages."""
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
@@ -60,7 +60,7 @@ class Header:
 
 
 def read_npy(stream: IO[bytes], size: int, *, field: str, limits: Limits, texts: bool = False) -> NDArray[np.generic]:
-    """Read one array from a stream that holds `size` bytes: of numbers, or of texts.
+    """Read one array of numbers, or of strings with `texts`, from a stream that holds `size` bytes.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def read_npy(stream: IO[bytes], size: int, *, field: str, limits: Limits, texts:
     """
     header, used = read_header(stream, field=field, limits=limits, texts=texts)
     if header.bytes != size - used:
-        raise damaged(field, f"a header that announces {header.bytes:,} bytes over {size - used:,} bytes of data")
+        raise damaged(field, f"a header that declares {header.bytes:,} bytes before {size - used:,} bytes of data")
     flat = np.zeros(header.bytes, dtype=np.uint8)
     view = flat.data
     filled = 0
@@ -84,7 +84,7 @@ def read_npy(stream: IO[bytes], size: int, *, field: str, limits: Limits, texts:
 
 
 def read_header(stream: IO[bytes], *, field: str, limits: Limits, texts: bool = False) -> tuple[Header, int]:
-    """Read and check the header alone, of numbers or of texts; returns it and the number of bytes it took."""
+    """Read and check only the header; return it and its length in bytes. With `texts`, the array must hold strings, otherwise numbers."""
     start = stream.read(8)
     if start[:6] != NPY_MAGIC or len(start) < 8:
         raise damaged(field, "no NumPy header")
@@ -103,9 +103,9 @@ def read_header(stream: IO[bytes], *, field: str, limits: Limits, texts: bool = 
 def read_npz(
     path: Path, *, field: str, limits: Limits, wanted: Collection[str] | None = None, texts: Collection[str] = ()
 ) -> tuple[Arrays, dict[str, str]]:
-    """Read the wanted members of a zip of arrays: of numbers, but for those named in `texts`.
+    """Read the wanted members of a zip of arrays; those named in `texts` hold strings, the others numbers.
 
-    Returns the arrays by name, without `.npy`, and the members that were not read, with the reason in words.
+    Returns the arrays by name, without `.npy`, and the skipped members with the reason.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def read_npz(
 
 
 def check_directory(path: Path, *, field: str) -> None:
-    """Look at the end of a zip file before the library builds one object for each entry of its directory."""
+    """Check the size of a zip's directory before the library builds an object for each of its entries."""
     size = path.stat().st_size
     with path.open("rb") as file:
         file.seek(max(0, size - (1 << 16) - 22))
@@ -152,7 +152,7 @@ def check_directory(path: Path, *, field: str) -> None:
 def checked_members(
     archive: zipfile.ZipFile, *, field: str, limits: Limits, wanted: Collection[str] | None = None
 ) -> dict[str, zipfile.ZipInfo]:
-    """Members by array name, once names, number, methods and the declared sizes of the wanted ones are found in order."""
+    """Return the members by array name after checking names, number, compression, and the declared size of the wanted ones."""
     infos = archive.infolist()
     spreadsheet = spreadsheet_kind([info.filename for info in infos])
     if spreadsheet is not None:
@@ -178,7 +178,8 @@ def checked_members(
             )  # fmt: skip
         if info.flag_bits & 1 or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise InvalidInput(
-                "unsupported_feature", field=field, expected="stored or deflated members", got=f"{name!r} encrypted or packed otherwise",
+                "unsupported_feature", field=field, expected="stored or deflated members",
+                got=f"{name!r} encrypted or compressed with another method",
                 hint="Write the file with numpy.savez or numpy.savez_compressed.",
             )  # fmt: skip
         members[name] = info
@@ -189,7 +190,7 @@ def checked_members(
 
 
 def film_as_tracks(got: str) -> InvalidInput:
-    """Return the refusal of a film that was sent as tracks."""
+    """Return the error for a film that was sent as tracks."""
     return InvalidInput(
             "film_as_tracks", field="tracks", expected="point tracks", got=got,
         hint="Send it as the film instead (on the page: under Film; REST: -F film=@film.mp4): its points are tracked for you.",
@@ -197,7 +198,7 @@ def film_as_tracks(got: str) -> InvalidInput:
 
 
 def spreadsheet_refusal(field: str, got: str) -> InvalidInput:
-    """Return the refusal of a spreadsheet program's own file, with the way to save it."""
+    """Return the error for a spreadsheet program's own file, with a hint on how to save it."""
     kinds = MESH_FILES if field == "mesh" else TRACK_FILES
     hint = (
         f"Save it as CSV in the spreadsheet program. {EXAMPLE}"
@@ -208,7 +209,7 @@ def spreadsheet_refusal(field: str, got: str) -> InvalidInput:
 
 
 def spreadsheet_kind(members: Collection[str]) -> str | None:
-    """Return what kind of spreadsheet a zip with these members is, None for anything else."""
+    """Return the kind of spreadsheet that a zip with these members is; None if it is none."""
     if "[Content_Types].xml" in members and any(name.startswith("xl/") for name in members):
         return "a spreadsheet (xlsx)"
     return "an OpenDocument file (ods)" if "mimetype" in members and "content.xml" in members else None
@@ -225,7 +226,7 @@ def pickle_refusal(field: str) -> InvalidInput:
 def read_file(
     path: Path, *, field: str, limits: Limits, wanted: Collection[str] | None = None, texts: Collection[str] = ()
 ) -> Arrays:
-    """Read a file that starts as .npy (named `array`) or as a zip of them; the arrays named in `texts` hold texts."""
+    """Read a .npy file (as `array`) or a zip of them; the arrays named in `texts` hold strings."""
     size = path.stat().st_size
     if size > limits.max_bytes:
         raise too_large(field, expected=f"a file of at most {limits.max_bytes:,} bytes", got=f"{size:,} bytes")

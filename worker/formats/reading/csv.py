@@ -1,4 +1,4 @@
-"""Tracks as a table of text: one observation a line, columns frame, point, x, y and optionally visible; or one row a frame."""
+"""Tracks as a text table: one observation per line, with columns frame, point, x, y and optionally visible; or one row per frame."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ from pliant.worker.formats.reading.pose_tables import (
 from pliant.worker.formats.records import Arrays, Limits
 
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-"""Beginnings of texts in UTF-16."""
+"""Byte order marks of UTF-16."""
 codecs.lookup("utf-16")  # imports the decoder now: a contained process cannot open its module later
 
 COLUMNS = ("frame", "point", "x", "y")
 SEEN = ("visible", "visibility")
 WIDE = 8
-"""A table without names of this many columns is taken for one row a frame, whose columns could mean anything."""
+"""Number of columns from which a table without names is rejected: its rows may be frames, and its columns could mean anything."""
 
 
 def looks_like_csv(head: bytes) -> bool:
-    """Whether the first line has cells: at least three, so that what is wrong with the table can be shown."""
+    """Return whether the first line has at least three cells, so that an error can show what is wrong with the table."""
     line = head.decode(_encoding(head), "replace").split("\n", 1)[0]
     return len(split(line, separator_of(line))) >= 3
 
 
 def read_csv(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
-    """Read one observation a line in any order, those that are missing hidden; or one row a frame, see `pose_tables`.
+    """Read one observation per line, in any order, or one row per frame, see `pose_tables`.
 
-    Frames and points are numbered as in the file, in rising order: the smallest number is the first frame, gaps in frames are
-    frames without observations, points are the numbers that occur. Returns `tracks (F, P, 2)` with NaN where there is no
-    observation, and `visibility (F, P)` if the file has it; the tracks of other writers under their own names.
+    The smallest frame number is the first frame; gaps are frames without observations. Points are the numbers that occur, in ascending
+    order. Missing observations are hidden. Returns `tracks (F, P, 2)` with NaN where there is no observation, and `visibility (F, P)` if
+    the file has it; tables of known writers under their own names.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def _encoding(start: bytes) -> str:
 
 
 def _read(lines: Iterator[str], *, field: str, limits: Limits) -> Arrays | tuple[list[str], list[list[float]]]:
-    """Read the lines: whole tracks where a row is a frame, else the names of the columns and the numbers below them."""
+    """Read the lines: arrays if a row is a frame, otherwise the names of the columns and the numbers below them."""
     first, before = next(lines, ""), 1
     while first and not first.strip(SEPARATORS + " \r\n"):
         first, before = next(lines, ""), before + 1
@@ -77,7 +77,7 @@ def _read(lines: Iterator[str], *, field: str, limits: Limits) -> Arrays | tuple
 
 
 def _observations(columns: list[str], rows: list[list[float]], *, field: str, limits: Limits) -> Arrays:
-    """Put observations into their places."""
+    """Arrange observations as arrays."""
     table = np.array(rows, dtype=np.float64).reshape(-1, len(columns))
     index = {name: column for column, name in enumerate(columns)}
     numbers = table[:, [index["frame"], index["point"]]]
@@ -116,7 +116,7 @@ def _observations(columns: list[str], rows: list[list[float]], *, field: str, li
 
 
 def _wide(first: str, lines: Iterator[str], *, field: str, limits: Limits, before: int) -> Arrays | None:
-    """Read a table with one row a frame; None for one with one observation a line."""
+    """Read a table with one row per frame; return None for a table with one observation per line."""
     separator = separator_of(first)
     heads = [cells(first, separator)]
     if heads[0][0].lower() == "scorer":
@@ -135,7 +135,7 @@ def _wide(first: str, lines: Iterator[str], *, field: str, limits: Limits, befor
 
 
 def _columns(first: str, lines: Iterator[str], *, field: str, limits: Limits) -> tuple[list[str], list[list[float]]]:
-    """Return the names of the columns and the numbers below them; without names the usual ones are taken."""
+    """Return the names of the columns and the numbers below them; a table without names has the default columns."""
     separator = separator_of(first)
     heads = split(first, separator)
     named = set(COLUMNS) <= set(heads)

@@ -1,6 +1,6 @@
-"""A static mesh from glTF 2.0, binary or JSON with embedded data. Vertices and indices of one primitive, in the file's order.
+"""A static mesh from glTF 2.0, binary or JSON with embedded data: vertices and indices of one primitive, in the file's order.
 
-Morph targets, skins, textures and node transforms do not matter here: a job needs to know which points are neighbours, and nothing else.
+Morph targets, skins, textures and node transforms are ignored: a job only needs to know which points are neighbours.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def read_glb(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
 
 
 def read_gltf(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
-    """Read a glTF of text whose buffer is embedded as base64; files beside it are refused.
+    """Read a glTF in JSON whose buffer is embedded as base64; external files are rejected.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """MATLAB .mat files of version 7.3, which are HDF5. Only plain data sets inside the file itself are read.
 
-HDF5 can point elsewhere: data sets in other files (external storage, virtual data sets) and links that leave the file; it can declare
-terabytes in a kilobyte. All of these are refused before a value is read. MATLAB stores columns first, so axes come out reversed and are
-turned back. Cells, and the fields of struct arrays, are references to data sets of the same file; those are followed one step.
+HDF5 can refer to other files (external storage, virtual data sets, external links) and can declare terabytes in a kilobyte. Both are
+rejected before a value is read. MATLAB stores columns first, so the axes in HDF5 are reversed, and are reversed back here. Cells and the
+fields of struct arrays are references to data sets of the same file, which are followed one step.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ UNREADABLE = (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeE
 """Exceptions of h5py for damaged files."""
 
 DEFLATE = 1032
-"""Bytes that deflate makes of one byte at most."""
+"""Maximum expansion of a byte by deflate."""
 
 SMALL = 16 << 20
-"""Bytes of a data set or chunk that are read without looking at how they are stored."""
+"""Bytes up to which a data set or chunk is read without checking how it is stored."""
 
 CHUNK_EXCESS = 4
-"""How many times the bytes of its data set a chunk may have: writers round chunks up along every axis."""
+"""Maximum size of a chunk relative to its data set: writers round chunks up along every axis."""
 
 MAX_OBJECTS = 512
 MAX_DEPTH = 4
@@ -68,7 +68,7 @@ def _collect(group: h5py.Group, prefix: str, found: Arrays, *, field: str, limit
 
 
 def _is_numeric(item: h5py.Dataset) -> bool:
-    """Whether MATLAB would call it a numeric or logical array with content."""
+    """Return whether a data set is a non-empty numeric or logical array in MATLAB."""
     kind = item.attrs.get("MATLAB_class", b"double")
     return item.dtype.kind in "fiub" and bool(item.size) and kind != b"char" and "MATLAB_empty" not in item.attrs
 
@@ -78,7 +78,7 @@ def _bytes(found: Arrays) -> int:
 
 
 def _cells(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limits) -> np.ndarray | None:
-    """Follow references to matrices of one shape, e.g. one for each frame, and put them along a new first axis."""
+    """Stack the referenced matrices, if all have one shape, e.g. one per frame, along a new first axis; otherwise return None."""
     _check_within(item, name, field)
     if item.size > MAX_CELLS:
         raise too_large(field, expected=f"at most {MAX_CELLS:,} cells", got=f"{name} of {item.size:,}")
@@ -101,7 +101,7 @@ def _check_within(item: h5py.Dataset, name: str, field: str) -> None:
 
 
 def check_before_reading(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limits) -> None:
-    """Refuse a data set that lies elsewhere, or with the bytes read `so_far` claims more than it can hold, before a value is read.
+    """Reject, before reading, a data set outside the file, above the limit with `so_far` bytes read, or larger than its storage allows.
 
     Raises
     ------
@@ -118,16 +118,16 @@ def check_before_reading(item: h5py.Dataset, name: str, so_far: int, field: str,
 
 
 def read_values(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limits) -> np.ndarray:
-    """Read a data set with its axes reversed, as MATLAB means them. Raises as `check_before_reading`."""
+    """Read a data set with its axes reversed to MATLAB's order; raises as `check_before_reading`."""
     check_before_reading(item, name, so_far, field, limits)
     values = np.asarray(item[()])
     return np.ascontiguousarray(values.T.astype(values.dtype.newbyteorder("="), copy=False))
 
 
 def _check_stored(item: h5py.Dataset, name: str, declared: int, field: str, limits: Limits) -> None:
-    """Refuse, before a value is decompressed, what its stored bytes cannot become: most of it was never written.
+    """Reject, before decompression, a data set that its stored bytes cannot expand to.
 
-    One pass of deflate makes at most 1032 bytes of one. A chunk is decompressed whole, however little of it is used.
+    Deflate expands one byte to at most 1032. A chunk is always decompressed as a whole.
     """
     stored = item.id.get_storage_size()
     if declared > SMALL and declared > DEFLATE * stored:

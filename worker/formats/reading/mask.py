@@ -14,7 +14,7 @@ MAX_PIXELS_A_POINT = 64
 
 
 def read_png(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
-    """Return `mask (rows, columns)` of bool: pixels of a PNG that are not black (and not wholly transparent) are points.
+    """Return `mask (rows, columns)` of bool: pixels of a PNG that are neither black nor fully transparent are points.
 
     Raises
     ------

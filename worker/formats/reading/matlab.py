@@ -1,6 +1,6 @@
 """MATLAB .mat files of version 5, the format of non-rigid structure-from-motion data sets: W, S, Rs, possibly inside structs.
 
-SciPy's reader trusts sizes and offsets, so a crafted file can crash it; it runs in the sandbox (`reading.sandbox`), never in a server.
+SciPy's reader trusts sizes and offsets, so a crafted file can crash it; it runs only in the sandbox (`reading.sandbox`).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def read_matlab5(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            listed = scipy.io.whosmat(stream)  # type: ignore[arg-type]  # the stubs know paths alone
+            listed = scipy.io.whosmat(stream)  # type: ignore[arg-type]  # the stubs accept paths only
             stream.seek(0)
             names = [str(name) for name, _, kind in listed if kind not in ("function", "opaque", "object", "sparse")]
             _check_declared([shape for name, shape, _ in listed if name in names], field, limits)
@@ -85,7 +85,7 @@ def _collect(name: str, value: object, found: Arrays, depth: int) -> None:
 
 
 def _stack_cells(name: str, cells: NDArray[np.object_], found: Arrays) -> None:
-    """Put cells that all hold a matrix of one shape, e.g. one per frame, along a new first axis; so each field of a struct array."""
+    """Stack cells that hold matrices of one shape, e.g. one per frame, along a new first axis; likewise each field of a struct array."""
     parts = list(cells.reshape(-1, order="F"))
     if all(isinstance(part, scipy.io.matlab.mat_struct) for part in parts):
         for member in parts[0]._fieldnames[:MAX_ARRAYS]:

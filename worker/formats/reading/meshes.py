@@ -1,7 +1,7 @@
 """Meshes from OBJ and PLY. Vertex order is the file's: nothing is merged, split, sorted or cleaned.
 
-General loaders split vertices at texture seams and merge equal ones, which destroys the correspondence of vertex i with point i;
-so OBJ is read here, `v` and `f` alone. PLY is read by plyfile, which keeps rows as they are.
+General loaders split vertices at texture seams and merge equal ones, which destroys the correspondence of vertex i with point i. OBJ is
+therefore parsed here, `v` and `f` only, and PLY by plyfile, which keeps rows as they are.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ NOT_A_MESH = "Give an OBJ, PLY, glTF or npz mesh, a grid size such as 48x64, or 
 
 
 def read_obj(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
-    """Read `vertices (V, 3)` and `faces (T, 3)` or `(T, 4)`, from 0, of a Wavefront OBJ; all but `v` and `f` is ignored.
+    """Read `vertices (V, 3)` and zero-based `faces (T, 3)` or `(T, 4)` of a Wavefront OBJ; keywords other than `v` and `f` are ignored.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def read_ply(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
 
 
 def join_polygons(polygons: list[list[int]], *, field: str) -> NDArray[np.int64]:
-    """One array of faces: quads stay quads if all are; otherwise polygons become fans of triangles."""
+    """Return one array of faces: quads stay quads if all are; otherwise polygons become fans of triangles."""
     sizes = {len(polygon) for polygon in polygons}
     if sizes and min(sizes) < 3:
         raise InvalidInput(
@@ -121,13 +121,13 @@ def given_vertices(arrays: Arrays, *, num_points: int) -> None:
 def mismatch(num_points: int, num_vertices: int) -> InvalidInput:
     """Return the error for a mesh that does not match the tracks."""
     return InvalidInput(
-        "vertex_count_mismatch", field="mesh", expected=f"{num_points} vertices, as the tracks have points", got=f"{num_vertices}",
+        "vertex_count_mismatch", field="mesh", expected=f"{num_points} vertices, one for each point of the tracks", got=f"{num_vertices}",
         hint="Vertex i of the mesh must be point i of the tracks, in the same order; omit the mesh to have one generated.",
     )  # fmt: skip
 
 
 def _obj_index(word: bytes, so_far: int) -> int:
-    """`7`, `7/1`, `7//3` count from 1; negative counts back from the latest vertex."""
+    """Return a zero-based index: `7`, `7/1` and `7//3` count from 1, negative numbers back from the latest vertex."""
     index = int(word.split(b"/", 1)[0])
     return index - 1 if index > 0 else so_far + index if index < 0 else -1
 

@@ -1,4 +1,4 @@
-"""The parsers that run in the sandbox, by name, and detection of their formats."""
+"""The parsers that run in the sandbox, by name, and the detection of their formats."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Parser:
     function: str
 
     def load(self) -> Callable[..., Arrays]:
-        """Return the function; a contained child calls this before it gives up the right to open files."""
+        """Return the function; the sandbox process calls this before it gives up the right to open files."""
         found: Callable[..., Arrays] = getattr(
             import_module(f"pliant.worker.formats.reading.{self.module}"), self.function
         )
@@ -63,7 +63,7 @@ PICKLE = tuple(bytes([0x80, version]) for version in range(2, 6))
 
 
 def recognise(head: bytes, field: str) -> str:
-    """Name the parser for a file by its first kilobyte.
+    """Return the name of the parser for a file, from its first kilobyte.
 
     Raises
     ------
@@ -112,13 +112,13 @@ def unknown_format(field: str, head: bytes) -> InvalidInput:
 
 
 def _in_words(head: bytes) -> str:
-    """Return what a file of an unknown format is, as far as its first bytes show."""
+    """Describe a file of unknown format by its first bytes."""
     if _is_text(head) and not head.startswith(b"%PDF"):
         start = head.lstrip(b"\xef\xbb\xbf \t\r\n")
         if start.startswith(b"<"):
             return "a web page or XML"
         begins = start.decode("utf-8", "replace").splitlines()[0][:40] if start else ""
-        if begins.count("\ufffd") <= len(begins) // 4:  # a few letters of another encoding are still text
+        if begins.count("\ufffd") <= len(begins) // 4:  # text with a few letters in another encoding
             return f"text that begins {begins!r}" if begins else "blank text"
     if head.startswith(UTF_16):
         begins = next(iter(head.decode("utf-16", "replace").strip().splitlines()), "")[:40]
@@ -130,7 +130,7 @@ def _in_words(head: bytes) -> str:
 
 
 def _refuse_pictures(head: bytes) -> None:
-    """Refuse films and pictures that were sent as tracks, with the way to send them."""
+    """Reject films and pictures that were sent as tracks, with a hint on how to send them."""
     kind = film_kind(head)
     if kind is not None:
         raise film_as_tracks(f"a film ({kind})")
@@ -143,7 +143,7 @@ def _refuse_pictures(head: bytes) -> None:
 
 
 def film_kind(head: bytes) -> str | None:
-    """Return what kind of film begins like this, None for anything else."""
+    """Return the kind of film that starts with these bytes; None if it is none."""
     if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide"):
         return "mp4 or mov"
     if head.startswith(b"\x1aE\xdf\xa3"):

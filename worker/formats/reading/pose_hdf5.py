@@ -1,8 +1,7 @@
-"""HDF5 files: DeepLabCut's tables and SLEAP's analysis files; all others as MATLAB 7.3 writes them.
+"""HDF5 files: DeepLabCut's tables, SLEAP's analysis files, and otherwise MATLAB 7.3.
 
-DeepLabCut's tables are written by pandas, which keeps the names of the columns pickled, or as levels and labels. Pickles are never
-opened: of those, the strings are listed. The order of the columns is x, y, likelihood for each body part, and it is checked by the
-values.
+DeepLabCut's tables are written by pandas, which stores the column names as a pickle, or as levels and labels. Pickles are never loaded;
+only their strings are extracted. The columns are x, y, likelihood for each body part, which the values must confirm.
 """
 
 from __future__ import annotations
@@ -22,12 +21,12 @@ from pliant.worker.formats.records import Arrays, Limits
 VALUES = "values_block_0"
 FIXED = "block0_values"
 MOST_LEVELS = 4
-"""Rows above DeepLabCut's columns: scorer, individuals, bodyparts, coords."""
+"""Maximum header rows above DeepLabCut's columns: scorer, individuals, bodyparts, coords."""
 
 STRINGS = frozenset(
     ("STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8")
 )
-"""Instructions of a pickle that hold a string."""
+"""Pickle opcodes that hold a string."""
 
 _SLEAP = ("node_names", "track_names", "track_occupancy", "edge_names")
 
@@ -86,7 +85,7 @@ def _deeplabcut(file: h5py.File, field: str, limits: Limits) -> Arrays | None:
 
 
 def _columns(values: NDArray[np.float64], field: str, heads: list[tuple[str, ...]]) -> Arrays:
-    """Take a table of x, y, likelihood for each body part apart; `heads` has the names of each column where they are known."""
+    """Split a table of x, y, likelihood for each body part; `heads` holds the header of each column, if known."""
     likelihood = values[:, 2::3] if values.ndim == 2 else values
     if (
         values.ndim != 2
@@ -104,7 +103,7 @@ def _columns(values: NDArray[np.float64], field: str, heads: list[tuple[str, ...
 
 
 def _levels(group: h5py.Group, field: str, limits: Limits) -> list[tuple[str, ...]]:
-    """Return the names of each column of a table in pandas' fixed form, whose levels are strings; empty where they are not."""
+    """Return the header of each column of a table in pandas' fixed format; empty unless its levels are strings."""
     columns: list[list[str]] = []
     for level in range(MOST_LEVELS):
         words, labels = _texts(group, f"axis0_level{level}", field, limits), _own(group, f"axis0_label{level}")
@@ -120,7 +119,7 @@ def _levels(group: h5py.Group, field: str, limits: Limits) -> list[tuple[str, ..
 
 
 def _pickled_heads(group: h5py.Group) -> list[tuple[str, ...]]:
-    """Return the names of each column of a table in pandas' table form; empty where they cannot be told."""
+    """Return the header of each column of a table in pandas' table format; empty if it cannot be determined."""
     held = group.attrs.get("non_index_axes")
     strings = strings_of(held) if isinstance(held, bytes) else []
     ends = [index for index, string in enumerate(strings) if string == "likelihood"]
@@ -131,7 +130,7 @@ def _pickled_heads(group: h5py.Group) -> list[tuple[str, ...]]:
 
 
 def strings_of(pickle: bytes) -> list[str]:
-    """List the strings of a pickle in order, without opening it: its instructions are read and none is carried out."""
+    """List the strings of a pickle in order; its opcodes are parsed but not executed."""
     found: list[str] = []
     memo: dict[int, str | None] = {}
     last: str | None = None
@@ -146,13 +145,13 @@ def strings_of(pickle: bytes) -> list[str]:
                 last = memo.get(place)
             if last is not None:
                 found.append(last)
-    except (ValueError, OverflowError):  # cut off, or no pickle
+    except (ValueError, OverflowError):  # truncated, or not a pickle
         return []
     return found
 
 
 def _texts(group: h5py.Group, name: str, field: str, limits: Limits) -> list[str]:
-    """Read strings, each as bytes of a fixed or its own length; empty where there are none."""
+    """Read strings of fixed or variable length; empty if there are none."""
     item = _own(group, name)
     if not isinstance(item, h5py.Dataset) or item.ndim != 1 or h5py.check_string_dtype(item.dtype) is None:
         return []
@@ -161,7 +160,7 @@ def _texts(group: h5py.Group, name: str, field: str, limits: Limits) -> list[str
 
 
 def _own(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
-    """Return a member that is stored in the file itself, None where there is no such member."""
+    """Return a member that is stored in the file itself; None if there is none."""
     if name not in group or not isinstance(group.get(name, getlink=True), h5py.HardLink):
         return None
     found = group[name]

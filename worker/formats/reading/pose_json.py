@@ -1,9 +1,8 @@
 """MediaPipe landmarks as JSON: a list of frames, each with the landmarks of one object.
 
-MediaPipe has no file format of its own; this reads what `MessageToDict`, the Tasks API's results and its JavaScript solutions give when
-each frame's result is appended to a list. A frame is a list of landmarks, an object that holds one (`landmarks`, `pose_landmarks`,
-`poseLandmarks`, `faceLandmarks`, …), or null or empty where nothing was detected. Where several objects were detected, the first is
-read.
+MediaPipe has no file format of its own; this reads the output of `MessageToDict`, the Tasks API and the JavaScript solutions, if each
+frame's result is appended to a list. A frame is a list of landmarks, an object that holds one (`landmarks`, `pose_landmarks`,
+`poseLandmarks`, `faceLandmarks`, …), or null or empty if nothing was detected. Of several detected objects, the first is read.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from pliant.worker.formats.point_names import found as found_names
 from pliant.worker.formats.records import Arrays, Limits
 
 MOST_BYTES = 64 << 20
-"""Bytes of a file; Python's objects take about ten times as many."""
+"""Maximum bytes of a file; Python's objects take about ten times as many."""
 
 CONFIDENCE = ("visibility", "presence", "score")
 
@@ -73,7 +72,7 @@ def read_landmarks(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
 
 
 def _names(landmarks: list[Any]) -> list[str]:
-    """Return the names of a frame's landmarks: their member `name`, or those of MediaPipe's models of so many landmarks."""
+    """Return the names of a frame's landmarks: their member `name`, or the names of MediaPipe's model with this number of landmarks."""
     given = [landmark.get("name") for landmark in landmarks]
     named = [name for name in given if isinstance(name, str)]
     return named if len(named) == len(given) else list(MEDIAPIPE.get(len(given), ()))
@@ -92,7 +91,7 @@ def _frames(document: Any, field: str) -> list[Any]:
 
 
 def _landmarks(frame: Any) -> list[Any] | None:
-    """Return the landmarks of a frame, empty where nothing was detected; None if there is no list of landmarks."""
+    """Return the landmarks of a frame, empty if nothing was detected; None if there is no list of landmarks."""
     if frame is None:
         return []
     if isinstance(frame, dict):
@@ -111,7 +110,7 @@ def _landmarks(frame: Any) -> list[Any] | None:
 
 
 def _of_the_world(frame: dict[str, Any], value: Any) -> bool:
-    """Whether a value is one of world landmarks, which are metres, beside landmarks of the picture."""
+    """Return whether a value holds world landmarks, which are in metres instead of picture coordinates."""
     return any(one is value and "world" in name.lower() for name, one in frame.items())
 
 

@@ -1,6 +1,6 @@
-"""Tables with one row a frame: DeepLabCut's csv, MediaPipe landmarks, and spreadsheets with named columns.
+"""Tables with one row per frame: DeepLabCut's csv, MediaPipe landmarks, and spreadsheets with named columns.
 
-Columns are named by point and coordinate: `nose_x`, `nose y`, `x0`, `y_3`; a confidence may stand beside them. DeepLabCut writes the
+Columns are named by point and coordinate: `nose_x`, `nose y`, `x0`, `y_3`; each point may have a confidence too. DeepLabCut writes the
 names in three or four rows: scorer, individuals (with several animals), bodyparts, coords.
 """
 
@@ -18,13 +18,13 @@ from pliant.worker.formats.point_names import found as found_names
 from pliant.worker.formats.records import Arrays, Limits
 
 SEPARATORS = "\t;,"
-"""By precedence: where tabs or semicolons separate the columns, commas may be decimal."""
+"""In order of precedence: if tabs or semicolons separate the columns, commas may be decimal."""
 
 LONGEST_ROW = 1 << 20
-"""Characters of a row; a row has two numbers for each point."""
+"""Maximum characters of a row; a row has two numbers for each point."""
 
 LANDMARKS = frozenset((21, 33, 468, 478, 543))
-"""Points of MediaPipe's hands, pose, face (without and with irises) and holistic models."""
+"""Numbers of points in MediaPipe's hand, pose, face (without and with irises) and holistic models."""
 
 EXAMPLE = "Write it as in `frame,point,x,y` and then `0,0,312.5,200.1`, or one row a frame: `frame,nose_x,nose_y,chin_x,chin_y`."
 
@@ -37,18 +37,18 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """Which columns hold what, by point."""
+    """Indices of the columns, by point."""
 
     x: list[int]
     y: list[int]
     confidence: list[int | None]
     writer: str
-    """The name under which the track array is handed on."""
+    """Name of the track array."""
     names: list[str]
 
 
 def separator_of(line: str) -> str:
-    """Return the character between the columns of a line."""
+    """Return the column separator of a line."""
     return next((sign for sign in SEPARATORS if sign in line), ",")
 
 
@@ -63,12 +63,12 @@ def cells(line: str, separator: str) -> list[str]:
 
 
 def number(cell: str, separator: str) -> float:
-    """Return the number in a cell, NaN where it is empty.
+    """Return the number in a cell, NaN if it is empty.
 
     Raises
     ------
     ValueError
-        It holds something else.
+        The cell holds something else.
     """
     words = {"": np.nan, "nan": np.nan, "na": np.nan, "true": 1.0, "false": 0.0}
     if cell in words:
@@ -79,7 +79,7 @@ def number(cell: str, separator: str) -> float:
 
 
 def not_a_table(field: str, count: int, line: str) -> InvalidInput:
-    """Return the refusal of a line, with the line."""
+    """Return the error for an unreadable line, which it quotes."""
     return InvalidInput(
             "unreadable_table", field=field, expected="a table with the columns frame, point, x and y, or with one row a frame",
         got=f"line {count}: {line.strip()[:80]!r}", hint=EXAMPLE,
@@ -87,7 +87,7 @@ def not_a_table(field: str, count: int, line: str) -> InvalidInput:
 
 
 def columns_of(heads: list[str]) -> Columns | None:
-    """Return what the columns hold whose heads are given; None unless at least two points have x and y."""
+    """Return the columns with these headings; None unless at least two points have x and y."""
     found: dict[str, dict[str, int]] = {}
     spelled: dict[str, str] = {}
     for index, head in enumerate(heads):
@@ -96,7 +96,7 @@ def columns_of(heads: list[str]) -> Columns | None:
         if fits is not None:
             axis = "confidence" if fits["axis"] in _CONFIDENCE else fits["axis"]
             found.setdefault(fits["point"], {}).setdefault(axis, index)
-            # Of some letters the small one is longer: then the name stays in small letters.
+            # Some letters get longer in lower case; the name then stays in lower case.
             spelled.setdefault(fits["point"], (head if len(head) == len(low) else low)[slice(*fits.span("point"))])
     points = [held for held in found.values() if "x" in held and "y" in held]
     if len(points) < 2:
@@ -116,7 +116,7 @@ def columns_of(heads: list[str]) -> Columns | None:
 
 
 def deeplabcut_columns(rows: list[list[str]]) -> Columns | None:
-    """Return what the columns of DeepLabCut's header rows hold; None unless they are such rows."""
+    """Return the columns below DeepLabCut's header rows; None if the rows are no such header."""
     heads = {row[0].lower(): row for row in rows}
     if not {"bodyparts", "coords"} <= set(heads) or len({len(row) for row in rows}) != 1:
         return None
@@ -138,7 +138,7 @@ def deeplabcut_columns(rows: list[list[str]]) -> Columns | None:
 def read_rows(
     lines: Iterator[str], columns: Columns, separator: str, *, field: str, limits: Limits, before: int, width: int
 ) -> Arrays:
-    """Read the rows below the names, of `width` cells; `before` lines were read already.
+    """Read the rows below the header, each of `width` cells; `before` lines were read already.
 
     Returns the tracks `(F, P, 2)` under the writer's name, NaN where a cell is empty, `likelihood (F, P)` if there are
     confidences, and `point_names` if the points have names.

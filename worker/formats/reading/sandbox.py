@@ -3,7 +3,7 @@
 Every format but plain .npy and .npz is parsed here. The process starts with two open files, the input and the output, and then gives up
 the right to open another descriptor (RLIMIT_NOFILE = 0), so a parser that is taken over reaches no other file and no network. Its
 memory, processor time and output size are limited; its environment and working directory are empty. It writes an npz, which the
-parent reads with the same checks as an uploaded npz, or a refusal as JSON.
+parent reads with the same checks as an uploaded npz, or an error as JSON.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Fewer points, spread evenly, and the mesh between them: every n-th row and column of a grid, or clusters of a mesh's vertices.
+"""Choose fewer points, spread evenly, and their mesh: every n-th row and column of a grid, or clusters of a mesh's vertices.
 
-A mesh is thinned as a centroidal Voronoi diagram on its own edges (the idea of Valette and Chassery, Approximated centroidal Voronoi
-diagrams for uniform polygonal mesh coarsening, 2004): seeds spread over the picture; every vertex goes to the seed that is nearest along
-the edges; each seed moves to the middle of its cluster; and two clusters are neighbours where an edge of the mesh joins them, so the
-faces kept are the triangles of the mesh whose corners lie in three clusters. The points kept are seeds: tracks of the input, unchanged
-and in the input's order, never averages. Edge lengths are the greatest seen in the picture over the frames, which is the nearest that
-two dimensions come to a surface's own.
+A mesh is thinned by a centroidal Voronoi diagram on its edges (the idea of Valette and Chassery, Approximated centroidal Voronoi diagrams
+for uniform polygonal mesh coarsening, 2004): seeds are spread over the picture, every vertex is assigned to the seed nearest along the
+edges, and each seed moves to the centre of its cluster. Two clusters are neighbours if an edge of the mesh joins them, so the new faces are
+the triangles of the mesh whose corners lie in three clusters. The kept points are the seeds: tracks of the input, unchanged and in the
+input's order, never averages. An edge is as long as its maximum length in the picture over the frames, the best 2-D estimate of its length
+on the surface.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from pliant.solver import InvalidInput, Mesh
 from pliant.solver.records import MIN_POINTS
 
 if TYPE_CHECKING:
-    from scipy.sparse import csr_array  # imported where a mesh is thinned, which few inputs want
+    from scipy.sparse import csr_array  # imported only where a mesh is thinned, which few inputs need
 
 SEED_MOVES = 4
-"""Moves of the seeds; the spread hardly changes after these."""
+"""Number of moves of the seeds; further moves hardly change the spread."""
 
 MEASURED_FRAMES = 8
-"""Frames that lengths and places are measured in."""
+"""Number of frames in which lengths and positions are measured."""
 
 Indices = NDArray[np.intp]
 
@@ -37,12 +37,12 @@ def thin(
     """Choose points by the options `stride` and `max_points`.
 
     Points are `(F, P, 2)`, NaN where hidden, of the selected frames. Returns the increasing indices of the kept points, their
-    mesh, None if neighbours are not known yet, and notes.
+    mesh, None if it is still to be generated, and notes.
 
     Raises
     ------
     InvalidInput
-        Code too_few_points, when a grid's stride leaves fewer than four.
+        Code too_few_points, if a grid's stride leaves fewer than four.
     """
     count = points.shape[1]
     limit = count if options.max_points is None else options.max_points
@@ -52,7 +52,7 @@ def thin(
         return _thin_grid(mesh.grid, options.stride, limit)
     if mesh is None or len(mesh.faces) == 0:
         kept = np.arange(0, count, options.stride)
-        how = f"every {options.stride}. of the list" if options.stride > 1 else "all"
+        how = f"one in {options.stride}" if options.stride > 1 else "all"
         if len(kept) > limit:
             kept, how = (
                 kept[spread(*_places(points[:, kept], visible if visible is None else visible[:, kept]), limit)],
@@ -76,7 +76,7 @@ def _thin_grid(grid: NDArray[np.int32], stride: int, limit: int) -> tuple[Indice
     numbers = np.full(int(grid.max()) + 1, -1)
     numbers[kept] = np.arange(len(kept))
     renumbered = np.where(coarse >= 0, numbers[np.maximum(coarse, 0)], -1)
-    note = f"{len(kept)} of {len(numbers)} points are used: every {stride}. row and column of the grid."
+    note = f"{len(kept)} of {len(numbers)} points are used: one in {stride} rows and columns of the grid."
     return kept.astype(np.intp), Mesh.from_grid(renumbered), [note]
 
 
@@ -119,7 +119,7 @@ def _thin_mesh(
 
 
 def spread(places: NDArray[np.float64], seen: NDArray[np.bool], limit: int, parts: Indices | None = None) -> Indices:
-    """Choose at most `limit` points evenly over the picture: cells as small as the number allows, one point of each part a cell.
+    """Choose at most `limit` points evenly over the picture: one point per cell and part, with the smallest cells that the limit allows.
 
     `places (m, P, 2)` are positions in some frames, `seen (m, P)` whether they are valid. `parts (P,)` numbers the connected
     components, which are sampled separately.
@@ -144,7 +144,7 @@ def spread(places: NDArray[np.float64], seen: NDArray[np.bool], limit: int, part
 
 
 def _one_a_cell(mean: NDArray[np.float64], low: NDArray[np.float64], size: float, parts: Indices | None) -> Indices:
-    """Return, of each cell (and part) that holds points, the point nearest its middle."""
+    """Return the point nearest the centre of each cell (and part) that holds points."""
     cell = np.floor((mean - low) / size)
     away = np.linalg.norm((mean - low) / size - cell - 0.5, axis=1)
     keys = np.column_stack([cell.astype(np.int64), np.zeros(len(cell), np.int64) if parts is None else parts])
@@ -154,7 +154,7 @@ def _one_a_cell(mean: NDArray[np.float64], low: NDArray[np.float64], size: float
 
 
 def edge_lengths(places: NDArray[np.float64], seen: NDArray[np.bool], edges: NDArray[np.int32]) -> csr_array:
-    """Return the mesh's edges as a graph, each as long as the greatest distance of its ends in a frame that shows both."""
+    """Return the mesh's edges as a graph; an edge's length is the maximum distance of its ends over the frames that show both."""
     from scipy.sparse import csr_array
 
     one, two = edges[:, 0], edges[:, 1]
@@ -168,12 +168,12 @@ def edge_lengths(places: NDArray[np.float64], seen: NDArray[np.bool], edges: NDA
 
 
 def split_quads(faces: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Leave triangles as they are, cut quads along their first diagonal."""
+    """Split quads along their first diagonal; triangles stay as they are."""
     return faces if faces.shape[1] == 3 else np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
 
 
 def _nearest(graph: csr_array, seeds: Indices) -> Indices:
-    """Return the number of the seed that is nearest along the edges, −1 where none can be reached."""
+    """Return the number of the seed nearest along the edges, −1 if none can be reached."""
     from scipy.sparse.csgraph import dijkstra
 
     _, _, source = dijkstra(graph, directed=False, indices=seeds, min_only=True, return_predecessors=True)
@@ -185,7 +185,7 @@ def _nearest(graph: csr_array, seeds: Indices) -> Indices:
 def _middles(
     graph: csr_array, edges: NDArray[np.int32], cluster: Indices, seeds: Indices, shown: NDArray[np.float64]
 ) -> Indices:
-    """Return, of each cluster, the vertex farthest from other clusters, those seen often preferred; the seed where there are none."""
+    """Return each cluster's vertex farthest from other clusters, preferring those seen often; the seeds if there are no other clusters."""
     from scipy.sparse.csgraph import dijkstra
 
     border = np.unique(edges[cluster[edges[:, 0]] != cluster[edges[:, 1]]])
@@ -193,7 +193,7 @@ def _middles(
         return seeds
     depth = dijkstra(graph, directed=False, indices=border, min_only=True)
     depth = np.where(np.isfinite(depth) & (cluster >= 0), depth * (0.1 + shown), -1.0)
-    depth[seeds] += 1e-12  # of equals, the seed stays
+    depth[seeds] += 1e-12  # in a tie, the seed stays
     order = np.lexsort((depth, cluster))
     last = np.flatnonzero(np.append(np.diff(cluster[order]) != 0, True))  # the deepest of each cluster comes last
     moved = seeds.copy()
@@ -204,7 +204,7 @@ def _middles(
 def _places(
     points: NDArray[np.generic], visible: NDArray[np.float64] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool]]:
-    """Return places in some frames, evenly chosen, and where they mean something; 0 elsewhere."""
+    """Return positions in evenly chosen frames, 0 where hidden, and where they are visible."""
     chosen = np.unique(np.linspace(0, len(points) - 1, MEASURED_FRAMES).round().astype(int))
     places = np.array(points[chosen], dtype=np.float64)
     seen: NDArray[np.bool] = np.asarray(np.isfinite(places).all(axis=2))

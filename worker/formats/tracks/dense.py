@@ -51,7 +51,7 @@ def flatten(name: str, array: NDArray[np.generic]) -> Flat:
 
 
 def flatten_like(array: NDArray[np.generic], grid: tuple[int, int] | None) -> NDArray[np.generic]:
-    """Lay pixels in a row in an array that goes with tracks, and remove axes of length 1 around what is left."""
+    """Flatten the pixels of an array that accompanies tracks, and remove outer axes of length 1."""
     if grid is not None and array.ndim >= 3:
         if array.shape[-2:] == grid:
             array = array.reshape(*array.shape[:-2], grid[0] * grid[1])
@@ -72,7 +72,7 @@ def _single(array: NDArray[np.generic]) -> NDArray[np.generic]:
 
 
 def _pictures(array: NDArray[np.generic]) -> Flat:
-    """`(F, H, W, c)` or `(F, 2, H, W)` as `(F, H·W, c)`."""
+    """Reshape `(F, H, W, c)` or `(F, 2, H, W)` to `(F, H·W, c)`."""
     if array.shape[-1] not in (2, 3) and array.shape[1] == 2:
         array = np.moveaxis(array, 1, 3)
     frames, rows, columns, numbers = array.shape

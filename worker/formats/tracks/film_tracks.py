@@ -1,4 +1,4 @@
-"""The output of `pliant track`: besides tracks it holds confidence, mesh, picture size, rate and texture, and all of them are used."""
+"""The output of `pliant track`: tracks with confidence, mesh, picture size, frame rate and texture, all of which are used."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_PICTURE_SIDE = 10**5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilmTracks:
-    """What a file of `pliant track` states besides its tracks."""
+    """Contents of a file of `pliant track` besides its tracks."""
 
     visible: NDArray[np.float64]
     """The tracker's confidence where a point is visible, else 0, shape `(F, P)`."""
@@ -37,16 +37,16 @@ class FilmTracks:
     """Frames per second."""
 
     texture: Texture | None
-    """The template frame with the place of every point in it; None where the file has been stripped of it."""
+    """The template frame with texture coordinates; None if they were removed from the file."""
 
 
 def read_film_tracks(path: Path, *, shape: tuple[int, int], limits: Limits) -> FilmTracks:
-    """Read what belongs to the tracks of a film from a file of `pliant track`; `shape` is frames and points.
+    """Read the contents of a file of `pliant track` besides its tracks; `shape` is frames and points.
 
     Raises
     ------
     InvalidInput
-        Code damaged_file where an array is missing or does not fit the tracks, and the codes of `read_arrays` and `Mesh`.
+        Code damaged_file if an array is missing or does not fit the tracks, and the codes of `read_arrays` and `Mesh`.
     """
     arrays = read_arrays(path, field="tracks", limits=limits, wanted=frozenset((*REQUIRED, *TEXTURE_ARRAYS)))
     missing = [name for name in REQUIRED if name not in arrays]
@@ -69,7 +69,7 @@ def read_film_tracks(path: Path, *, shape: tuple[int, int], limits: Limits) -> F
 
 
 def tracks_options(options: Options, interpretation: Interpretation) -> Options:
-    """Fill in what a file of tracks states, where the options give nothing: the picture's size and the frame rate."""
+    """Return the options with the image size and frame rate of a tracks file, unless the options set them."""
     stated: dict[str, Any] = {}
     if options.image_size is None and interpretation.image_size is not None:
         stated["image_size"] = interpretation.image_size

@@ -94,7 +94,7 @@ def understand(arrays: Arrays, options: Options) -> Understood:
 
 
 def _of_our_tracker(named: Arrays, name: str, options: Options) -> Understood:
-    """Read tracks whose axes, unit and direction are known; visibility and mesh follow from the rest of the file."""
+    """Interpret tracks whose axes, unit and y direction are known; visibility and mesh are read by `film_tracks`."""
     points = _numeric(named[name], name)
     if points.ndim != 3 or points.shape[2] != 2:
         raise InvalidInput(
@@ -111,7 +111,7 @@ def _of_our_tracker(named: Arrays, name: str, options: Options) -> Understood:
 
 
 def _names(named: Arrays, count: int, *, ordered: bool) -> tuple[str, ...] | None:
-    """Return the names of `count` points: those that an npz states, else those of an export whose points come second (`ordered`)."""
+    """Return the names of `count` points from an npz or, if its second axis is the points (`ordered`), from a tracker's export."""
     given = named.get(NAMES)
     if given is not None and given.dtype.kind in "US":
         return stated(given, count)
@@ -152,7 +152,7 @@ def _two_numbers(
 
 
 def _projected(depths: NDArray[np.generic], reading: Reading, named: Arrays) -> Placed:
-    """Project points in space; unless the file has ground truth, they are used as such."""
+    """Project points in space; they also serve as ground truth, unless the file has its own."""
     spatial = depths.transpose(1, 0, 2) if reading.order == "points_frames" else depths
     intrinsics = next((named[one] for one in INTRINSICS if one in named), None)
     points, kind, notes = project(spatial, intrinsics)
@@ -179,7 +179,7 @@ def _numeric(array: NDArray[np.generic], name: str) -> NDArray[np.generic]:
 
 
 def wrong_numbers(field: str, array: NDArray[np.generic]) -> InvalidInput:
-    """Not an array of real numbers."""
+    """Return the error for an array that does not hold real numbers."""
     return InvalidInput(
         "wrong_type",
         field=field,

@@ -120,7 +120,7 @@ def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: 
     InvalidInput
         Code wrong_shape if no interpretation fits.
     AmbiguousInput
-        When several do.
+        Several interpretations fit.
     """
     allowed = [one for one in readings(name, array) if _is_allowed(one, options)]
     if not allowed:

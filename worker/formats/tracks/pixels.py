@@ -15,7 +15,7 @@ from pliant.worker.formats.records import MAX_COORDINATE
 MAX_COMPARED = 100_000
 SLACK = 0.02
 MIN_INSIDE_SHARE = 0.9
-"""Share of points that must lie inside the picture for coordinates to be fractions of it; none may lie a picture size outside."""
+"""Share of points that must be inside the picture for coordinates to count as fractions of it; none may be a picture size outside."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

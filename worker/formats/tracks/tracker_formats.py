@@ -2,11 +2,11 @@
 
 Sources: each project's documented output at the time of writing. CoTracker `pred_tracks (B, T, N, 2)` and `pred_visibility`; TAPIR,
 BootsTAPIR and LocoTrack `tracks (B, N, T, 2)` with `occlusion` and `expected_dist` logits; TAPNext `(B, T, N, 2)` with
-`visible_logits` (its model returns y before x, its demonstrations turn that round); TAP-Vid `points (N, T, 2)` with `occluded`;
+`visible_logits` (y before x from its model, x before y from its demonstrations); TAP-Vid `points (N, T, 2)` with `occluded`;
 AllTracker `trajs_e` and `visconfs_e`, or whole pictures `(B, T, 2, H, W)`; PIPs++ `trajs_e`; DOT `(B, T, H, W, 3)` or `(B, T, N, 3)`
 with visibility as the third number; TAPVid-3D `tracks_xyz` in metres before the camera; MATLAB data sets of non-rigid structure from
-motion `W`, `S`, `Rs`. Pliant's own tracker is known by `frame_indices`. DeepLabCut, SLEAP and MediaPipe: the names that
-`reading.pose_tables` and `reading.pose_hdf5` give their arrays.
+motion `W`, `S`, `Rs`. Pliant's own tracker is recognised by `frame_indices`. DeepLabCut, SLEAP and MediaPipe: the array
+names given by `reading.pose_tables`, `reading.pose_hdf5` and `reading.pose_json`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Dialect:
 
 
 OWN = "Pliant"
-"""The output of `pliant track`; what else it holds is read by `film_tracks`."""
+"""The output of `pliant track`; `film_tracks` reads its other arrays."""
 
 DIALECTS = (
     Dialect(name=OWN, tracks=("tracks",), needs=("frame_indices",)),
@@ -100,7 +100,7 @@ def short_names(arrays: Arrays) -> Arrays:
     Raises
     ------
     AmbiguousInput
-        Two structs hold tracks of one name.
+        Two structs contain track arrays of the same name.
     """
     shortened: Arrays = {}
     whole: dict[str, str] = {}
