@@ -1,4 +1,4 @@
-"""`python -m pliant.cli` is `pliant`."""
+"""Entry point of `python -m pliant.cli`, which equals `pliant`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`pliant demo`: one complete run from a rendered film with known true shapes to a textured moving mesh."""
+"""`pliant demo`: a complete run, from a rendered film with ground truth to a textured moving mesh."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """The film of a demonstration."""
+    """Parameters of the demonstration film."""
 
     frames: int
     size: tuple[int, int]
     """Width and height in pixels."""
 
     points: int
-    """Points that are reconstructed, at most."""
+    """Maximum number of reconstructed points."""
 
     @property
     def template(self) -> int:
-        """The frame on which the region is drawn: the middle one, in which the face looks at the camera."""
+        """Frame on which the region is drawn: the middle frame, in which the face looks at the camera."""
         return self.frames // 2
 
 
@@ -47,25 +47,26 @@ FULL = Scene(frames=30, size=(240, 180), points=800)
 SMALL = Scene(frames=8, size=(160, 120), points=300)
 
 MODEL_POINTS = 3000
-"""Vertices of the rendered face: its facets are then about a pixel wide in the full film."""
+"""Vertices of the rendered face, which makes its facets about one pixel wide in the full film."""
 
 DEGREES, DISTANCE = 30.0, 5.0
-"""The face turns by so much to both sides, at so many times half its height from the camera: an arm's length and a half."""
+"""Largest rotation of the face to either side, degrees, and its distance from the camera in half heights of the face: about
+one and a half arm's lengths."""
 
 GOOD: Mapping[str, float] = {"e3d_frame": 0.08, "track_median": 0.7, "track_p95": 3.0}
-"""Errors above which the demonstration counts as failed: relative 3-D error, pixels, pixels."""
+"""Largest errors with which the demonstration succeeds: relative 3-D error, pixels, pixels."""
 
 MEANINGS: Mapping[str, str] = {
     "e3d_frame": f"{METRIC_MEANINGS['e3d_frame']}; one scale fitted, since a film shows none",
     "track_median": "error of the tracks in pixels, median",
     "track_p95": "error of the tracks in pixels, 95 % are below",
-    "visibility_precision": "share of the points called visible that are",
+    "visibility_precision": "share of points marked visible that are visible",
     "visibility_recall": "share of the visible points called visible",
 }
 
 DEMO_OUTPUT = Path("demo-output")
 DEMO_FILES = ("film.mp4", "region.png", "tracks.npz", *RESULT_FILES, "shapes.glb")
-"""Files that are refused before anything is rendered, if they exist in a folder that was named."""
+"""Files that must not exist in the folder given with `--output`, unless `--force` is given. Checked before rendering."""
 
 STOPS_WITHIN = 60.0
 
@@ -85,7 +86,7 @@ def demo(
 ) -> None:
     """Turn a rendered film of a face into a moving mesh, using the real service, queue and worker.
 
-    Compares the tracks and the mesh with the truth. Exit code 0 only if the errors are small.
+    Compares the tracks and the mesh with the ground truth. The exit code is 0 only if the errors are small.
     """
     session: Session = ctx.obj
     session.json = as_json
@@ -135,7 +136,7 @@ def render(scene: Scene, folder: Path) -> RenderedFilm:
 
 
 def compare(film: RenderedFilm, paths: Mapping[str, Path]) -> dict[str, float]:
-    """Compare the downloaded tracks and shapes with the film's truth."""
+    """Compare the downloaded tracks and shapes with the film's ground truth."""
     import numpy as np
     from pliant.tracking.rendering import Truth
 
@@ -196,7 +197,7 @@ def report(
 
 @contextmanager
 def running(folder: Path) -> Iterator[str]:
-    """Run `pliant up` on a free port with data and log in a folder, which is created; yield its address, and stop it afterwards.
+    """Run `pliant up` on a free port, with data and log in a folder that is created; yield its address, then stop it.
 
     Raises
     ------
@@ -211,7 +212,7 @@ def running(folder: Path) -> Iterator[str]:
     elsewhere = ("PLIANT_REDIS_URL", "PLIANT_BLOB_URL", "PLIANT_HOST", "PLIANT_AUTH", "PLIANT_TOKEN")
     environment = {name: value for name, value in os.environ.items() if name not in elsewhere}
     folder.mkdir(parents=True, exist_ok=True)
-    # Started in its own folder, for a `.env` of the current one describes another installation.
+    # Started in its own folder: a `.env` file in the current folder configures another installation.
     with log.open("wb") as errors:
         process = subprocess.Popen(  # noqa: S603 - our own program
             command, stdout=subprocess.PIPE, stderr=errors, env=environment, cwd=folder, start_new_session=True, text=True

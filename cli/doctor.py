@@ -89,7 +89,7 @@ def fsck(ctx: typer.Context, data: Data = None, as_json: Json = False) -> None:
 
 
 def settings_here() -> Settings:
-    """Return the settings of this machine; the defaults where the extra `server`, which reads them, is missing."""
+    """Return the settings of this machine, or the defaults if the extra `server`, which reads them, is not installed."""
     from pliant.worker.settings import Settings
 
     return Settings() if missing_modules() else Settings.from_environment()
@@ -151,7 +151,7 @@ def check_packages(version_of: Callable[[str], str] = version) -> Iterator[Findi
 def check_blas() -> Iterator[Finding]:
     """Time matrix products, which reveals a missing or oversubscribed BLAS, and count the active threads.
 
-    Processor time over wall time is the number of threads that ran; it is lower on a busy machine.
+    The number of active threads is processor time divided by wall time, which is lower on a busy machine.
     """
     import os
 
@@ -298,7 +298,7 @@ def show(findings: list[Finding]) -> None:
 
 
 def check_blobs() -> Iterator[Finding]:
-    """Check the blob store of PLIANT_BLOB_URL by listing what it holds."""
+    """Check the blob store of PLIANT_BLOB_URL by listing its contents."""
     url = settings_here().blob_url
     if url is None:
         return
@@ -308,14 +308,14 @@ def check_blobs() -> Iterator[Finding]:
     try:
         Blobs.open(url).check()
     except StoreUnavailable as fault:
-        advice = "Check the address, the bucket and the AWS_ variables; the line above has the store's own words."
+        advice = "Check the address, the bucket and the AWS_ variables; the store's own message is above."
         yield Finding("blobs", "bad", f"{url} cannot be used ({fault.reason})", advice)
     else:
         yield Finding("blobs", "good", f"{url} answers")
 
 
 def _redis(address: str) -> Finding:
-    """Send a command with the password of the address, which only an authenticated connection may."""
+    """Check that the server accepts the credentials of the address, and that it does not evict keys."""
     from urllib.parse import urlsplit
 
     parts = urlsplit(address)

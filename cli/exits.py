@@ -1,4 +1,4 @@
-"""Exit codes of the command line, and which error ends with which."""
+"""Exit codes of the command line, and the errors that lead to them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typer.core import TyperGroup
 
 
 class Exit(IntEnum):
-    """How a command ended. docs/reference/cli.md lists the codes; a test compares the two."""
+    """Exit code of a command. docs/reference/cli.md lists the codes; a test compares the two."""
 
     DONE = 0
     """The command succeeded."""
@@ -59,11 +59,11 @@ _CODES: tuple[tuple[str, str, Exit], ...] = (
     ("pliant.worker.errors", "NewerData", Exit.NOT_NOW),
     ("pliant.worker.errors", "WorkerError", Exit.UNREACHABLE),
 )
-"""The first entry that matches counts. By name, so that only modules that are loaded already are looked at."""
+"""Exit codes of error classes; the first match applies. Classes are given by name, so that no module is imported for the lookup."""
 
 
 def code_of(fault: BaseException) -> Exit | None:
-    """Return the exit code of an error with a message for the user; None for a defect, which keeps its traceback."""
+    """Return the exit code of an expected error, or None for a bug, whose traceback is shown."""
     if isinstance(fault, KeyboardInterrupt):
         return Exit.INTERRUPTED
     for module, name, code in _CODES:
@@ -77,7 +77,7 @@ def code_of(fault: BaseException) -> Exit | None:
 def sentence_of(fault: BaseException, job: str | None = None, *, others: int = 0) -> str:
     """Return the message for an error that ended a command.
 
-    `job` is the id of the job that it waited for; `others` further jobs had been submitted and not yet seen to the end.
+    `job` is the id of the job that the command was waiting for; `others` is the number of further submitted, unfinished jobs.
     """
     if isinstance(fault, KeyboardInterrupt):
         if job is None:
@@ -85,7 +85,7 @@ def sentence_of(fault: BaseException, job: str | None = None, *, others: int = 0
         if others > 0:
             rest = "1 other" if others == 1 else f"{others} others"
             return (
-                f"Interrupted. Job {job} and {rest} continue: the same command again returns to all of them, "
+                f"Interrupted. Job {job} and {rest} continue: repeat the command to follow all of them, "
                 f"`pliant watch {job}` follows this one, `pliant cancel {job}` stops it."
             )
         return f"Interrupted. Job {job} continues: `pliant watch {job}` follows it, `pliant cancel {job}` stops it."
@@ -96,7 +96,7 @@ def sentence_of(fault: BaseException, job: str | None = None, *, others: int = 0
 
 
 class Guarded(TyperGroup):
-    """The group of all commands: turns errors into a message and an exit code."""
+    """Group of all commands, which turns errors into a message and an exit code."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""

@@ -1,4 +1,4 @@
-"""Optional parts of Pliant that some commands need."""
+"""The optional dependencies that some commands need."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def missing_modules() -> list[str]:
 
 
 def require_server(command: str) -> None:
-    """Return if the extra `server` is installed.
+    """Check that the extra `server` is installed.
 
     Raises
     ------
     MissingExtra
-        It is not.
+        The extra is not installed.
     """
     if missing_modules():
         raise MissingExtra(command)

@@ -1,4 +1,4 @@
-"""`pliant solve` for films: the film is decoded in a process of its own, then solved in this one."""
+"""`pliant solve` for films: a separate process decodes the film, and this process solves it."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
 
 
 def is_film(path: Path, region: Path | None) -> bool:
-    """Return True if a command's input is a film: by its content and name, or because a region was given."""
+    """Return True if a command's input is a film, by its content and name or because a region was given."""
     from pliant.worker.films.sources import looks_like_film
 
     return region is not None or looks_like_film(path)
 
 
 def refuse_parts_of_tracks(**parts: object) -> None:
-    """Refuse inputs that belong to tracks beside a film.
+    """Refuse inputs that are only valid with tracks, because a film was given.
 
     Raises
     ------
     BadArgument
-        One was given.
+        At least one of them was given.
     """
     from pliant.client.errors import BadArgument
 
@@ -40,7 +40,7 @@ def refuse_parts_of_tracks(**parts: object) -> None:
 
 
 def inspect_film(film: Path, *, region: Path | None, options: dict[str, Any], as_json: bool) -> None:
-    """Print what a film states, and how many points tracking it would follow in what time.
+    """Print a film's properties, and an estimate of its tracked points and tracking time.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def inspect_film(film: Path, *, region: Path | None, options: dict[str, Any], as
 
 
 def film_rows(facts: FilmFacts) -> list[tuple[str, str]]:
-    """Describe a film as pairs of name and text."""
+    """Return a film's properties as pairs of label and text."""
     of_all = f" of {facts.stated_frames}" if facts.frames != facts.stated_frames else ""
     rows = [
         ("film", facts.container),
@@ -90,7 +90,7 @@ def film_rows(facts: FilmFacts) -> list[tuple[str, str]]:
 def solve_film(
     film: Path, output: Path, *, region: Path | None, options: dict[str, Any], name: str, threads: int | None, as_json: bool
 ) -> Finished:  # fmt: skip
-    """Track and reconstruct a film; `tracks.npz` and `contact_sheet.jpg` lie beside the other files.
+    """Track and reconstruct a film; also write `tracks.npz` and `contact_sheet.jpg`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Ids of jobs as people type them: whole, a unique prefix, or ``@last``."""
+"""Job ids on the command line: a complete id, a unique prefix, or ``@last``."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ if TYPE_CHECKING:
 
 LAST = "@last"
 SEARCHED = 1000
-"""Newest jobs that are searched for a prefix."""
+"""Number of newest jobs that are searched for a prefix."""
 
 
 def find_job(client: Client, text: str) -> RemoteJob:
-    """Return the job that a command line names: an id, the beginning of exactly one id, or ``@last``, the newest job.
+    """Return the job for a complete id, a unique prefix, or ``@last``, the newest job.
 
     Raises
     ------
     NotFound
-        No job fits, or ``@last`` was given and there is no job yet.
+        No job matches, or ``@last`` was given and there is no job yet.
     BadArgument
-        The text is malformed, or more than one job fits.
+        The text is malformed, or more than one job matches.
     """
     from pliant.client import BadArgument, NotFound
     from pliant.schemas.job import Problem

@@ -65,9 +65,9 @@ def submit(
     key: Key = None, webhook: Webhook = None, wait: Wait = False, output: Folder = None, force: Force = False, url: Url = HOME,
     timeout: Timeout = None, as_json: Json = False,
 ) -> None:  # fmt: skip
-    """Submit tracks or a film to a service and print the job; of several files a table.
+    """Submit tracks or a film to a service and print the job, or a table of jobs for several files.
 
-    Repeating the command for several files finds the jobs that exist already: each is known by the contents of its files and the options.
+    With several files, repeating the command finds the existing jobs by the contents of the files and the options.
     """
     from pliant.cli.commands.batch import Batch, expanded
 
@@ -105,7 +105,7 @@ def submit(
 def _submitted(
     session: Session, client: Client, given: dict[str, Any], *, wait: bool, output: Path | None, force: bool
 ) -> RemoteJob:
-    """Submit one job with a progress bar, and follow it to its end and download its files where that is wanted."""
+    """Submit one job with a progress bar; if requested, wait for it and download its files."""
     from pliant.client.progress import progress_bar
 
     with progress_bar(line_every=LINE_EVERY) as bar:
@@ -148,7 +148,7 @@ def result(
         list[str] | None,
         typer.Option(
             "--make",
-            help="Have this written of the stored result first: glb, ply, obj, usd, abc, mdd, mat or csv; may be repeated. "
+            help="First write this from the stored result: glb, ply, obj, usd, abc, mdd, mat or csv; may be repeated. "
             "Only these files are downloaded then.",
         ),
     ] = None,
@@ -157,7 +157,7 @@ def result(
     timeout: Timeout = None,
     as_json: Json = False,
 ) -> None:
-    """Download the files of a finished job; an interrupted download is continued."""
+    """Download the files of a finished job. Interrupted downloads resume."""
     from pliant.client.progress import progress_bar
 
     with ctx.obj.client(url, as_json=as_json) as client:
@@ -235,7 +235,7 @@ def delete(
 ) -> None:
     """Delete jobs and their files from the service."""
     with ctx.obj.client(url, as_json=as_json) as client:
-        found = [find_job(client, job) for job in jobs]  # all of them, before the first is deleted
+        found = [find_job(client, job) for job in jobs]  # find all of them before deleting the first
         for job in found:
             job.delete()
     ids = [job.id for job in found]
@@ -246,7 +246,7 @@ def delete(
 
 
 def options(ctx: typer.Context, url: Url = "", as_json: Json = False) -> None:
-    """List every option with meaning, bounds and default: of the service if --url is given, else of this installation."""
+    """List every option with its meaning, bounds and default, for the service at --url or else this installation."""
     if url == "":
         from pliant.schemas.options import Options
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pliant.worker.settings import Settings
 
 RESULT_FILES = ("shapes.npz", "report.json")
-"""Files of every result: a folder that has one of them holds a result."""
+"""Files of every result; a folder with one of them contains a result."""
 
 
 def input_file(path: Path | None, name: str) -> None:
@@ -23,7 +23,7 @@ def input_file(path: Path | None, name: str) -> None:
     Raises
     ------
     BadArgument
-        It is missing, a folder, or not readable.
+        The file is missing, a folder, or not readable.
     """
     from pliant.client.errors import BadArgument
     from pliant.client.multipart import existing_file
@@ -41,7 +41,7 @@ def mesh_file(mesh: str | None) -> None:
     Raises
     ------
     BadArgument
-        It is none of them.
+        The text is none of these.
     """
     from pliant.client.errors import BadArgument
 
@@ -61,7 +61,7 @@ def tracks_or_film(path: Path) -> None:
     Raises
     ------
     BadArgument
-        It is missing, not readable, or a folder without pictures.
+        The path is missing, not readable, or a folder without pictures.
     """
     from pliant.client.errors import BadArgument
     from pliant.worker.films.sources import PICTURES
@@ -78,12 +78,12 @@ def tracks_or_film(path: Path) -> None:
 def check_inputs(
     tracks: Path | None, *, mesh: str | None, ground_truth: Path | None, rotations: Path | None, region: Path | None
 ) -> None:
-    """Check the paths of all inputs of a job; those that are None are not given.
+    """Check the paths of all inputs of a job; None stands for an input that was not given.
 
     Raises
     ------
     BadArgument
-        One of them cannot be read.
+        An input cannot be read.
     """
     if tracks is not None:
         tracks_or_film(tracks)
@@ -93,12 +93,12 @@ def check_inputs(
 
 
 def installation(settings: Settings) -> None:
-    """Check that a service has used the data directory, before anything is created in it. A Redis server needs no directory.
+    """Check that a service has used the data directory, before anything is created in it. Not checked with a Redis server.
 
     Raises
     ------
     BadArgument
-        It is missing, or has none of an installation's folders.
+        The directory is missing, or has none of an installation's folders.
     """
     from pliant.client.errors import BadArgument
     from pliant.worker.paths import FOLDERS
@@ -112,12 +112,12 @@ def installation(settings: Settings) -> None:
 
 
 def output_file(path: Path | None, option: str, *, force: bool) -> None:
-    """Check that a file can be written, before the work that it is written after.
+    """Check that a file can be written, before starting the work that produces it.
 
     Raises
     ------
     BadArgument
-        It is a folder, exists already, or its folder is missing or not writable.
+        The path is a folder or, without `force`, an existing file; or its folder is missing or not writable.
     """
     from pliant.client.errors import BadArgument
 
@@ -156,12 +156,12 @@ def made_folder(folder: Path, option: str) -> None:
 
 
 def output_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FILES) -> None:
-    """Create the folder of the results and check that it can take them; without `force` it may hold none of `files`.
+    """Create the output folder and check that it is writable and, without `force`, contains none of `files`.
 
     Raises
     ------
     BadArgument
-        The path is a file, the folder is not writable, or it holds one of the files.
+        The path is a file, the folder is not writable, or it contains one of the files.
     """
     from pliant.client.errors import BadArgument
 
@@ -174,7 +174,7 @@ def output_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FI
 
 
 def different_files(job: Job, folder: Path, only: list[str] | None = None) -> list[str]:
-    """Return the files of a job that a folder holds with other content: a download would replace them."""
+    """Return the files of a job that a folder contains with different content, which a download would replace."""
     from pliant.client.multipart import sha256
 
     wanted = [artifact for artifact in job.artifacts if only is None or artifact.name in only]
@@ -187,12 +187,12 @@ def different_files(job: Job, folder: Path, only: list[str] | None = None) -> li
 
 @contextmanager
 def results_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FILES) -> Iterator[None]:
-    """Run the work that writes results into a folder: checked as by `output_folder` before, and removed if it was made in vain."""
+    """Prepare a folder with `output_folder` for the block; afterwards remove it if it is new and still empty."""
     new = not folder.exists()
     output_folder(folder, force=force, files=files)
     try:
         yield
     finally:
         if new:
-            with suppress(OSError):  # it holds results
+            with suppress(OSError):  # it is not empty
                 folder.rmdir()

@@ -35,9 +35,10 @@ Tracks = Annotated[
     ),
 ]
 Region = Annotated[
-    Path | None, typer.Option("--region", help="Of a film: mask picture of its size; white is tracked.", readable=False)
+    Path | None,
+    typer.Option("--region", help="For a film: mask picture of the same size; white is tracked.", readable=False),
 ]
-"""Paths are checked by the commands: one exit code and one form of message for every wrong path."""
+"""The commands check paths themselves, so that every invalid path has the same exit code and form of message."""
 Mesh = Annotated[
     str | None, typer.Option("--mesh", "-m", help="Mesh file, or the size of a grid such as 12x20.", metavar="FILE|RxC")
 ]
@@ -53,7 +54,7 @@ Name = Annotated[
 ]
 
 LINE_EVERY = 30.0
-"""Without a terminal, waiting commands print a line this often, seconds."""
+"""Seconds between the lines that a waiting command prints without a terminal."""
 
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 
@@ -68,14 +69,14 @@ class Session:
     transport: httpx.BaseTransport | None = None
     """Replaces the network in tests."""
     url: str | None = None
-    """Address of the service that the command talks to; it explains the errors of its answers."""
+    """Address of the service that the command uses, which also serves explanations of its errors."""
     following: str | None = None
     """Id of the job that the command waits for; Ctrl-C prints how to return to it."""
     others: int = 0
-    """Further jobs that the command has submitted and not yet seen to the end."""
+    """Number of further jobs that the command has submitted and not yet waited for."""
 
     def client(self, url: str, *, as_json: bool, first_contact: float | None = None) -> Client:
-        """Return a client; the token comes from PLIANT_TOKEN, so that it never appears in a list of processes."""
+        """Return a client; the token comes from PLIANT_TOKEN, so that it never appears in process listings."""
         from pliant.client import Client
         from pliant.client.retry import Retry
 
@@ -85,19 +86,19 @@ class Session:
 
 
 def name_of(given: str, file: Path) -> str:
-    """Return the name of a job: the one given, or that of its file without the ending, as far as a service takes it."""
+    """Return the name of a job: the given one, or its file's name without extension, truncated to the service's limit."""
     from pliant.client.multipart import job_name
 
     return given or job_name(file.resolve().name if file.is_dir() else file.stem)
 
 
 def parse_options(pairs: list[str] | None) -> dict[str, Any]:
-    """Read NAME=VALUE pairs; a value that is not JSON is text.
+    """Parse NAME=VALUE pairs; a value that is not valid JSON is a string.
 
     Raises
     ------
     BadArgument
-        A pair without ``=``.
+        A pair has no ``=``.
     """
     from pliant.client.errors import BadArgument
 
@@ -114,9 +115,9 @@ def parse_options(pairs: list[str] | None) -> dict[str, Any]:
 
 
 def one_numerical_thread() -> None:
-    """Limit the numerical libraries to one thread: solver and tracker have threads of their own.
+    """Limit the numerical libraries to one thread, because solver and tracker run their own threads.
 
-    The libraries read these variables when they are imported, so call it before anything that imports NumPy.
+    Call it before NumPy is imported: the libraries read these variables on import.
     """
     from pliant.worker.settings import NUMERICAL_THREADS
 

@@ -1,4 +1,4 @@
-"""Output of the command line: for people with rich, for scripts as JSON."""
+"""Output of the command line: text and tables with rich, or JSON for scripts."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ def out() -> Console:
 
 
 METRIC_MEANINGS: Mapping[str, str] = {
-    "e3d_frame": "3-D error: distance from the ground truth, each frame turned to fit best; share of the object's size",
+    "e3d_frame": "3-D error: distance from the ground truth after the best rotation of each frame; share of the object's size",
     "e3d_frame_scaled": "the same after one scale for the whole sequence",
     "e3d_sequence": "the same after one orthogonal alignment for the whole sequence",
     "e3d_frame_similarity": "the same after rotating, mirroring and scaling each frame to fit",
     "e3d_mocap": "as the motion capture literature defines it; share of the shape's spread",
     "coverage": "share of the positions within their 90 % interval",
-    "reprojection_median": "from a visible track to the projected shape, median; in the tracks' unit",
-    "reprojection_rms": "the same, root mean square: sensitive to outliers",
+    "reprojection_median": "median distance from a visible track to the projected shape, in the tracks' unit",
+    "reprojection_rms": "root mean square of the same distances; sensitive to outliers",
     "rotation_degrees": "mean angle between estimated and true cameras, in degrees",
-    "focal_error": "of the focal length, share of the true one",
+    "focal_error": "error of the focal length, share of the true value",
 }
-"""What each metric of a job is, the headline first. The page has the same words (`service/web/src/results.ts`)."""
+"""Meaning of each metric of a job, the headline metric first. The web page uses the same text (`service/web/src/results.ts`)."""
 
 
 def err() -> Console:
@@ -53,7 +53,7 @@ def print_json(value: object) -> None:
 
 
 def show_fault(fault: BaseException, sentence: str, code: Exit, *, as_json: bool, url: str | None = None) -> None:
-    """Print an error on standard error, and where its code is explained; `url` is the service that the command used."""
+    """Print an error and a reference to its explanation on standard error; `url` is the service that the command used."""
     details = details_of(fault)
     more = explained_at(details, url)
     if as_json:
@@ -71,9 +71,9 @@ def show_fault(fault: BaseException, sentence: str, code: Exit, *, as_json: bool
 
 
 def explained_at(details: Mapping[str, Any], url: str | None) -> str | None:
-    """Return where the code of an error (`details_of`) is explained; None without a known code.
+    """Return the URL or command that explains the code in an error's `details_of`; None without a known code.
 
-    It is the service's page if the error is an answer of the service at `url`, else the command that prints the same text.
+    Errors of the service at `url` are explained by a page of that service, others by `pliant explain`, which prints the same text.
     """
     from pliant.schemas.problems import find_code, type_of
 
@@ -135,7 +135,7 @@ def show_job(job: Job, *, as_json: bool) -> None:
 
 
 def verdict_lines(result: Job | Finished) -> list[Text]:
-    """Return the verdict with its reasons as the last lines of an output; none where a job was not judged."""
+    """Return the lines with the verdict and its reasons; empty if there is no verdict."""
     if result.verdict is None:
         return []
     words, colour = VERDICTS.get(result.verdict, (result.verdict, "yellow"))
@@ -146,7 +146,7 @@ def verdict_lines(result: Job | Finished) -> list[Text]:
 
 
 def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
-    """Describe how inputs were read, as pairs of name and text."""
+    """Return the interpretation of the inputs as pairs of label and text."""
     given = [
         name for name, there in
         (("ground truth", interpretation.has_ground_truth), ("cameras", interpretation.has_rotations)) if there
@@ -169,7 +169,7 @@ def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
 
 
 def metrics_table(metrics: Mapping[str, float]) -> Table:
-    """Return the metrics and what they mean as a table, `e3d_frame` first."""
+    """Return a table of the metrics and their meanings, `e3d_frame` first."""
     table = Table("metric")
     table.add_column("value", justify="right")
     table.add_column("meaning")
@@ -190,7 +190,7 @@ def show_jobs(jobs: Iterable[Job], *, as_json: bool) -> None:
         return
     table = Table(box=None, pad_edge=False)
     listed = list(jobs)
-    # Ids are for copying: on a narrow terminal, and in a pipe, the other columns give way.
+    # Ids stay complete, so that they can be copied: on narrow terminals and in pipes the other columns shrink.
     table.add_column("id", no_wrap=True, min_width=max((len(job.id) for job in listed), default=0))
     for heading in ("status", "verdict", "progress", "created", "frames × points", "name"):
         table.add_column(heading)

@@ -46,7 +46,7 @@ def solve(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Reconstruct tracks or a film in this process, without a service: the same code, the same files."""
+    """Reconstruct tracks or a film in this process, without a service. The output files are the same."""
     ctx.obj.json = as_json
     one_numerical_thread()  # the first check of a path imports NumPy
     check_inputs(tracks, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=region)
@@ -64,7 +64,7 @@ def solve(
 
 
 def files_of(options: dict[str, Any], *, film: bool) -> list[str]:
-    """Return the names of the files that a result with these options may have.
+    """Return the names of the files that a result with these options may contain.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def inspect(
     ] = "",
     as_json: Json = False,
 ) -> None:
-    """Show how a track file is read, or what a film holds and what tracking it would take, without solving."""
+    """Show how a track file is interpreted, or a film's properties and estimated tracking time, without solving."""
     ctx.obj.json = as_json
     check_inputs(file, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=region)
     options = parse_options(option)
@@ -178,7 +178,7 @@ def file_or_word(mesh: str | None) -> Path | str | None:
 
 
 def show_understood(interpretation: Interpretation) -> None:
-    """Print how inputs were read."""
+    """Print the interpretation of the inputs."""
     from rich.table import Table
     from rich.text import Text
 

@@ -1,4 +1,4 @@
-"""`pliant token`: access to the service. The commands use the store directly, so they are for operators, not for users."""
+"""`pliant token`: manage access tokens. The commands access the store directly, so they are for operators, not for users."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def create(
     data: Data = None,
     as_json: Json = False,
 ) -> None:
-    """Create a token and print it, once: the service stores only its SHA-256."""
+    """Create a token and print it. It cannot be shown again: the service stores only its SHA-256."""
     ctx.obj.json = as_json
     from pliant.cli.paths import input_file
     from pliant.worker.tokens import parse_duration
@@ -85,7 +85,7 @@ def create(
             text=None if source is None else source.read_text(encoding="utf-8").strip(),
         )
     if source is not None and not as_json:
-        err().print(f"Token {token.id} for {token.name} is known.", markup=False)
+        err().print(f"Token {token.id} for {token.name} is registered.", markup=False)
         return
     if as_json:
         print_json({**shown(token), "token": text})
@@ -165,14 +165,14 @@ def scopes_of(words: list[str]) -> list[Any]:
 
 @contextmanager
 def store(data: Path | None, *, new: bool = False) -> Iterator[Tokens]:
-    """Open the tokens of an installation, whether its service is running or not.
+    """Open the tokens of an installation, whether or not its service is running.
 
-    With `new` it may be created: the first token is made before the service runs.
+    With `new` the installation need not exist yet, because the first token is created before the service starts.
 
     Raises
     ------
     BadArgument
-        There is no installation, and none may be created.
+        There is no installation, and `new` is False.
     """
     require_server("pliant token")
     from pliant.worker.processes.valkey import attended

@@ -36,7 +36,7 @@ def track(
         int | None, typer.Option("--template-frame", help="Frame whose points are followed.", min=0)
     ] = None,
     frames: Annotated[
-        str | None, typer.Option("--frames", help="At most so many frames, or start:stop:step, e.g. 0:300:2.")
+        str | None, typer.Option("--frames", help="Maximum number of frames, or start:stop:step, e.g. 0:300:2.")
     ] = None,
     grid_step: Annotated[
         float | None, typer.Option("--grid-step", help="Distance of neighbouring points in pixels.")

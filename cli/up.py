@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pliant.worker.settings import Settings
 
 READY_WITHIN = 120.0
-"""Seconds until every part must answer; the first start compiles Python's caches."""
+"""Seconds within which every component must be ready; the first start also compiles Python bytecode."""
 
 ANYWHERE = {"0.0.0.0": "127.0.0.1", "::": "::1", "": "127.0.0.1"}  # noqa: S104 - translated, not bound
 """The address to connect to when the service listens on every address."""
@@ -69,7 +69,7 @@ def up(
     auth: Auth = None,
     as_json: Json = False,
 ) -> None:
-    """Run everything: service, page, queue and workers. Ctrl-C stops it.
+    """Run a complete installation: service, web page, queue and workers. Ctrl-C stops it.
 
     Without PLIANT_REDIS_URL it also runs a Valkey server, whose data is in the data directory.
     """
@@ -108,7 +108,7 @@ def _announce(url: str, settings: Settings, *, as_json: bool) -> None:
 
 
 def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json: Json = False) -> None:
-    """Run only workers, for a service elsewhere with the same PLIANT_REDIS_URL and PLIANT_BLOB_URL."""
+    """Run only workers, for a service that uses the same PLIANT_REDIS_URL and PLIANT_BLOB_URL."""
     ctx.obj.json = as_json
     require_server("pliant work")
     from pliant.worker.processes.supervisor import Supervisor, worker_children
@@ -168,13 +168,13 @@ def address(host: str, port: int) -> str:
 
 
 def service_child(settings: Settings, host: str, port: int, url: str, *, auth: str) -> Child:
-    """Return the API process as a child that counts as started once every part is ready."""
+    """Return the API process as a child that counts as started once every component is ready."""
     from pliant.service.settings import ServiceSettings
     from pliant.worker.environment import given
     from pliant.worker.processes.supervisor import Child
 
     env = {**settings.to_environment(), "PLIANT_HOST": host, "PLIANT_PORT": str(port), "PLIANT_AUTH": auth}
-    # No access log between the lines of this terminal, unless it is requested.
+    # Keep the access log out of this terminal, unless a log level was set.
     if "log_level" not in given(ServiceSettings):
         env["PLIANT_LOG_LEVEL"] = "warning"
     command = [sys.executable, "-m", "pliant.service"]
@@ -182,9 +182,9 @@ def service_child(settings: Settings, host: str, port: int, url: str, *, auth: s
 
 
 def until_ready(url: str) -> Callable[[subprocess.Popen[bytes]], None]:
-    """Return a function that waits until every part of the service is ready.
+    """Return a function that waits until every component of the service is ready.
 
-    It asks without the SDK, whose libraries would stay in the memory of a process that only starts others.
+    It does not use the SDK, whose libraries would stay in the memory of this process.
 
     Raises
     ------

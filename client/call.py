@@ -1,4 +1,4 @@
-"""One request as data, and the httpx request that it becomes."""
+"""A request as data, and its conversion to an httpx request."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ CONNECT_TIMEOUT = 10.0
 """Seconds allowed for opening a connection."""
 
 REDIRECT_TIMEOUT = 5.0
-"""The same for a connection to the object store that the service redirects to; the service is the alternative."""
+"""The same for the object store that the service redirects to; shorter, because the service itself is the fallback."""
 
 SILENCE_TIMEOUT = 60.0
-"""Seconds without a byte after which a connection counts as lost; longer than the service holds any answer back."""
+"""Seconds without a byte after which a connection counts as lost; longer than the service delays any response."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,11 +35,11 @@ class Call:
     form: Form | None = None
     """Multipart body; its files are reopened for each attempt."""
     body: Remainder | None = None
-    """Raw body, likewise."""
+    """Raw body from a file, which is also reopened for each attempt."""
     content: bytes | None = None
     """Short body, sent as it is."""
     changes_nothing: bool = False
-    """True for a POST without side effects, or whose repetition finds the first one's work."""
+    """True for a POST that has no side effects or has them only once."""
 
     @property
     def repeatable(self) -> bool:
@@ -54,7 +54,7 @@ def base_of(url: str) -> str:
     Raises
     ------
     BadArgument
-        Not an http or https address.
+        The text is not an http or https address.
     """
     try:
         parsed = httpx.URL(url)
@@ -98,8 +98,8 @@ def request_for(
 def redirected(location: str, call: Call, timeout: float) -> httpx.Request:
     """Build the request that follows a redirect to an object store.
 
-    The token and other headers of the client are for the service alone. The store's entity tag is not the service's, so `If-Range`
-    would never hold there; the service has checked it.
+    The client's token and other headers must not be sent to the store. `If-Range` is omitted, too: the store's entity tags differ
+    from the service's, which has already evaluated it.
     """
     names = ("Accept-Encoding", "Range")
     headers = {"User-Agent": f"pliant-client/{version('pliant')}"}
@@ -109,7 +109,7 @@ def redirected(location: str, call: Call, timeout: float) -> httpx.Request:
 
 
 def _raw(http: httpx.Client | httpx.AsyncClient, call: Call, rest: Remainder, timeout: float) -> httpx.Request:
-    """Build a request whose body is the remainder of a file; the stream serves both kinds of client."""
+    """Build a request whose body is the remainder of a file, for either kind of client."""
     length = rest.path.stat().st_size - rest.offset
     headers = {**call.headers, "Content-Length": str(length), "Content-Type": "application/octet-stream"}
     plain = http.build_request(call.method, call.path, headers=headers, timeout=_limits(timeout))

@@ -9,7 +9,7 @@
     ├── NotLoaded                a result's arrays were read before they were downloaded
     ├── InvalidSignature         a webhook message is forged, altered or too old
     ├── APIStatusError           the service answered with an error: problem+json with code and detail
-    │   ├── InvalidRequest       400, 413, 415, 422: the input is invalid; see `field`, `expected`, `got`
+    │   ├── InvalidRequest       400, 413, 415, 422: the input is invalid; see `problem`
     │   ├── NotAuthorized        401, 403: the token is missing or lacks a scope
     │   ├── NotFound             404, 410: no such job or file, or it was deleted
     │   ├── NotAllowedNow        409: the job's status does not allow the operation
@@ -89,7 +89,7 @@ class APIStatusError(PliantError):
     Attributes
     ----------
     problem : Problem
-        The whole document: `code`, `detail`, and where they apply `field`, `expected`, `got`, `hint`, `choices`.
+        The complete document: `code`, `detail` and, where they apply, `field`, `expected`, `got`, `hint`, `choices`.
     retry_after : float or None
         Seconds to wait, from the Retry-After header.
     """
@@ -176,7 +176,7 @@ BY_STATUS: Mapping[int, type[APIStatusError]] = {
 
 
 def error_from(status: int, headers: Mapping[str, str], body: bytes) -> APIStatusError | UnexpectedAnswer:
-    """Return the exception for an answer with status 400 or above."""
+    """Return the exception for a response with status 400 or above."""
     media_type = headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type != PROBLEM_TYPE:
         start = body[:200].decode("utf-8", "replace").strip()

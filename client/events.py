@@ -1,4 +1,4 @@
-"""Server-sent events: the parser, and the job that a sequence of events describes."""
+"""Server-sent events: their parser, and their application to a job record."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Message:
 class Parser:
     """Incremental parser of an event stream (HTML standard, section 9.2.6).
 
-    It is fed bytes, so that the caller sees every chunk, comments included, and can enforce its time limit on them.
+    The caller feeds it bytes and so sees every chunk, including comments, which lets it enforce its time limit.
     """
 
     def __init__(self) -> None:
@@ -75,7 +75,7 @@ class Position:
 
 
 def merged(job: Job | None, message: Message) -> Job | None:
-    """Apply an event to a job; events of unknown kinds change nothing.
+    """Apply an event to a job and return the result; unknown events are ignored.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The files and fields of a submission, from arrays, dictionaries of trackers, or paths."""
+"""The files and fields of a submission, made from arrays, dictionaries of trackers, or paths."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Form:
     files: Mapping[str, Path]
     on_upload: OnBytes | None = None
     before: int = 0
-    """Bytes of the submission that were uploaded already."""
+    """Bytes of the submission that have already been uploaded."""
 
     @property
     def size(self) -> int:
@@ -48,14 +48,14 @@ class Form:
 
     @contextmanager
     def open(self) -> Iterator[dict[str, tuple[str, IO[bytes], str]]]:
-        """Open the files in the form that httpx takes; reading them reports progress."""
+        """Open the files in the form that httpx accepts; reading them reports progress."""
         count = Count(self.before + self.size, self.on_upload)
         count.add(self.before)
         with ExitStack() as stack:
             opened = {}
             for name, path in self.files.items():
                 file = CountedFile(stack.enter_context(path.open("rb")), count)
-                file_name = path.name.encode("utf-8", "replace").decode()  # the system's names need not be UTF-8
+                file_name = path.name.encode("utf-8", "replace").decode()  # file names need not be valid UTF-8
                 opened[name] = (file_name, cast(IO[bytes], file), "application/octet-stream")
             yield opened
 
@@ -70,7 +70,7 @@ class Remainder:
     """Called with the offset in the file up to which bytes were handed to the connection."""
 
     def pieces(self) -> Iterator[bytes]:
-        """Yield them, at most `PIECE` bytes at a time."""
+        """Yield the bytes, at most `PIECE` at a time."""
         with self.path.open("rb") as file:
             file.seek(self.offset)
             while piece := file.read(PIECE):
@@ -82,17 +82,17 @@ PIECE = 1 << 18
 """Bytes of a raw body read at a time."""
 
 RESUMABLE_BYTES = 32 * 2**20
-"""Bytes of all files of a submission above which they are uploaded before the job."""
+"""Total size of a submission's files above which they are uploaded before the job, bytes."""
 
 SMALL = 2**20
-"""Bytes of a file that is sent with the job in any case."""
+"""Size up to which a file is always sent with the job, bytes."""
 
 LONGEST_NAME = 200
-"""Characters of a job's name that a service takes."""
+"""Maximum length of a job's name, characters."""
 
 
 class Count:
-    """Bytes read of all files of a form."""
+    """Counter of the bytes read from all files of a form."""
 
     def __init__(self, total: int, report: OnBytes | None) -> None:
         self.total = total
@@ -120,7 +120,7 @@ class CountedFile:
         return data
 
     def fileno(self) -> int:
-        """Give httpx access to the file's length."""
+        """Return the file descriptor, from which httpx reads the file's length."""
         return self._file.fileno()
 
 
@@ -138,12 +138,12 @@ class Inputs:
     inputs_of: str | None = None
 
     def form(self, folder: Path, fields: Mapping[str, str], on_upload: OnBytes | None) -> Form:
-        """Return the form that carries them; arrays are written to files in `folder`.
+        """Return the form with these inputs; arrays are written to files in `folder`.
 
         Raises
         ------
         BadArgument
-            An input cannot be sent.
+            An input is missing, conflicts with another one, or cannot be sent.
         """
         texts = dict(fields)
         if self.inputs_of is not None:
@@ -172,7 +172,7 @@ class Inputs:
         return Form(fields=texts, files=files, on_upload=on_upload)
 
     def _alone(self) -> str:
-        """Return the job whose inputs are used again, if nothing else was given."""
+        """Return the id of the job whose inputs are reused; raise if another input was given."""
         others = [
             each.name
             for each in dataclass_fields(self)
@@ -245,7 +245,7 @@ def checked_options(options: Options | Mapping[str, Any] | None) -> Options:
     Raises
     ------
     BadArgument
-        An option is unknown or invalid; the message lists each with what is allowed.
+        An option is unknown or invalid; the message lists each such option with its allowed values.
     """
     if isinstance(options, Options):
         return options
@@ -282,13 +282,13 @@ def expanded(path: Path | str, name: str) -> Path:
         return Path(path).expanduser()
     except RuntimeError:
         raise BadArgument(
-            f"{name}: expected a path, got {path}, and {Path(path).parts[0]} is nobody's home directory. "
+            f"{name}: expected a path, got {path}, and {Path(path).parts[0]} is no user's home directory. "
             "Write out the whole path."
         ) from None
 
 
 def job_name(of_file: str) -> str:
-    """Return the name of a job that is called like its file, as far as a service takes it."""
+    """Return the name of a job for a file name: valid UTF-8, truncated to `LONGEST_NAME` characters."""
     return of_file.encode("utf-8", "replace").decode()[:LONGEST_NAME]
 
 
@@ -298,7 +298,7 @@ def existing_file(path: Path | str, name: str) -> Path:
     Raises
     ------
     BadArgument
-        There is no file, it is a folder, or it cannot be read.
+        The file is missing, a folder, or not readable.
     """
     found = expanded(path, name)
     if found.is_dir():

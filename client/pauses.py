@@ -1,4 +1,4 @@
-"""Waiting and slow local work, once for each client: `make client` replaces the asynchronous names by the others."""
+"""Waiting and slow local work, for each kind of client: `make client` replaces the asynchronous functions by the synchronous ones."""
 
 from __future__ import annotations
 

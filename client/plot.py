@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 MOST_POINTS = 5000
 MOST_TRIANGLES = 30_000
-"""Most points and triangles in one plot: points are thinned out, larger meshes are drawn as points."""
+"""Maximum number of points and triangles in one plot: points are subsampled, larger meshes are drawn as points."""
 
 CLAY = np.array([0.85, 0.79, 0.71])
 LIGHT = np.array([-0.5, -0.6, 0.62])

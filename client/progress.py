@@ -23,7 +23,7 @@ class Bar:
         self._bars = bars
         self._task = bars.add_task("", total=1.0, note="")
         self.label = ""
-        """What is shown beside the progress, for example which of several files it is of."""
+        """Text shown next to the progress, for example the name of the file."""
         self.latest = ""
         """The display as one line of text."""
 
@@ -77,7 +77,7 @@ def progress_bar(console: Console | None = None, *, line_every: float | None = N
     console : rich.console.Console, optional
         Defaults to standard error.
     line_every : float, optional
-        Where there is no terminal, print a line this often, seconds; by default print nothing there.
+        Seconds between printed lines if there is no terminal; by default nothing is printed.
 
     Examples
     --------
@@ -106,9 +106,9 @@ def progress_bar(console: Console | None = None, *, line_every: float | None = N
 
 @contextmanager
 def printed_lines(latest: Callable[[], str], screen: Console, *, seconds: float) -> Iterator[None]:
-    """Print the time that has passed and the latest state as a line every so many seconds.
+    """Print a line with the elapsed time and the latest state every `seconds`.
 
-    From a thread: callbacks may be further apart.
+    A thread prints it, because callbacks may be further apart.
     """
     finished, began = threading.Event(), time.monotonic()
 

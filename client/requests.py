@@ -35,7 +35,7 @@ def sharing(days: float) -> ShareRequest:
     Raises
     ------
     BadArgument
-        It would be valid for less than a minute or more than 366 days.
+        The lifetime is less than a minute or more than 366 days.
     """
     try:
         return ShareRequest(expires_in=round(days * DAY))

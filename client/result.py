@@ -35,7 +35,7 @@ class Reconstruction:
     job : Job
         The final record: options, interpretation, metrics, warnings, artifacts.
     folder : Path
-        Where downloaded files are; a temporary folder is removed together with this object.
+        Folder of the downloaded files; a temporary folder is removed together with this object.
     """
 
     def __init__(self, job: Job, folder: Path | str | None) -> None:
@@ -58,12 +58,12 @@ class Reconstruction:
 
     @property
     def rotations(self) -> NDArray[np.float64]:
-        """Camera from world, shape (F, 3, 3); orthographic: the first two rows project."""
+        """Rotations from world to camera, shape (F, 3, 3); orthographic cameras project with the first two rows."""
         return self.arrays["rotations"]
 
     @property
     def shapes_std(self) -> NDArray[np.float32] | None:
-        """Standard deviation of every position, shape (F, P), the tracks' unit; None where the prior has no posterior."""
+        """Standard deviation of every position, shape (F, P), the tracks' unit; None if the prior has no posterior."""
         return self.arrays.get("shapes_std")
 
     @property
@@ -76,18 +76,18 @@ class Reconstruction:
 
     @property
     def point_names(self) -> tuple[str, ...] | None:
-        """Names of the points, P of them, as the tracks' file has them (DeepLabCut, SLEAP, MediaPipe, named columns); None without."""
+        """Names of the P points in the track file (DeepLabCut, SLEAP, MediaPipe, named columns); None if it has none."""
         names = self.arrays.get("point_names")
         return None if names is None else tuple(names.tolist())
 
     @property
     def verdict(self) -> str | None:
-        """Whether the result can be used: `good`, `with_care` or `do_not_use`; None where it was not judged."""
+        """Whether the result can be used: `good`, `with_care` or `do_not_use`; None without a verdict."""
         return self.job.verdict
 
     @property
     def camera(self) -> dict[str, Any]:
-        """The camera model and its lens, as the report states them: `model`, `focal`, `focal_std`, `field_of_view`, `sentence` and more."""
+        """The report's camera model and lens: `model`, `focal`, `focal_std`, `field_of_view`, `sentence` and more."""
         camera: dict[str, Any] = self.report["camera"]
         return camera
 
@@ -99,7 +99,7 @@ class Reconstruction:
 
     @property
     def field_of_view(self) -> float | None:
-        """Horizontal field of view in degrees; None for orthographic cameras and where `image_size` is not known."""
+        """Horizontal field of view in degrees; None for orthographic cameras or if `image_size` is unknown."""
         angle: float | None = self.camera.get("field_of_view")
         return angle
 
@@ -126,7 +126,7 @@ class Reconstruction:
         return self.job.metrics if self.job.metrics is not None else {}
 
     def plot(self, frames: int = 4) -> Figure:
-        """Draw some frames of the shape in 3-D, as a lit surface if the job has a mesh. Needs matplotlib.
+        """Draw frames of the shape in 3-D, as a lit surface if the job has a mesh. Needs matplotlib.
 
         Parameters
         ----------
@@ -158,7 +158,7 @@ def copied(source: Path, path: Path | str) -> Path:
 
 
 def loaded(job: Job) -> tuple[str, ...]:
-    """Return the files that `wait` and `result` download; a job that wrote further files has no arrays of its own."""
+    """Return the files that `wait` and `result` download; a job that only writes further files has no arrays."""
     return LOADED if job.outputs_of is None else (REPORT,)
 
 
@@ -181,7 +181,7 @@ def succeeded(job: Job) -> Job:
     Raises
     ------
     JobFailed, JobCancelled
-        It has none.
+        The job has no result.
     """
     if job.status is Status.FAILED:
         raise JobFailed(job)
@@ -196,7 +196,7 @@ def finished(job: Job) -> Job:
     Raises
     ------
     NotAllowedNow, JobFailed, JobCancelled
-        It is not finished, or has no result.
+        The job is not finished, or has no result.
     """
     if not job.status.final:
         raise NotAllowedNow(

@@ -13,7 +13,7 @@ from pliant.client.call import Call
 from pliant.client.errors import APIStatusError, PliantError, ServiceFailed, TooManyRequests, Unreachable, WaitTimeout
 
 TEMPORARY = frozenset({502, 503, 504})
-"""Statuses of a service, or of a proxy in front of it, that is unavailable for a moment."""
+"""Statuses of a temporarily unavailable service, or of a proxy in front of it."""
 
 OUT_OF_STEP = frozenset({"upload_offset_mismatch", "upload_busy", "upload_taken_over", "upload_complete"})
 """Codes after which the client reads the upload's offset again and continues from there."""
@@ -30,7 +30,7 @@ class Retry:
     """Give up after this long without success, seconds."""
 
     first_contact: float = 5.0
-    """The same until the service has answered once, so that a wrong address fails quickly, seconds."""
+    """The same until the service has responded once, so that a wrong address fails quickly, seconds."""
 
     shortest_pause: float = 0.25
     """Upper bound of the first pause, seconds; it doubles with each further failure."""
@@ -39,10 +39,10 @@ class Retry:
     """Upper bound of every pause, seconds."""
 
     long_poll: float = 20.0
-    """Longest time, seconds, for which `wait` lets the service hold one answer back."""
+    """Longest time that `wait` lets the service delay one response, seconds."""
 
     poll_interval: float = 0.5
-    """Pause between two reads of a job where the service does not hold answers back, seconds."""
+    """Pause between two requests for a job if the service does not delay responses, seconds."""
 
     clock: Callable[[], float] = time.monotonic
     """Returns seconds, from any origin."""
@@ -53,12 +53,12 @@ class Retry:
 
 @dataclass(kw_only=True)
 class Contact:
-    """What a client remembers between calls."""
+    """State that a client keeps between calls."""
 
     made: bool = False
-    """True once the service has answered."""
+    """True once the service has responded."""
     follows: bool = True
-    """Whether downloads may be redirected to the object store; False once a redirect led nowhere."""
+    """Whether downloads may be redirected to the object store; False once a redirect failed."""
 
 
 @dataclass(kw_only=True)
@@ -69,7 +69,7 @@ class Attempts:
     contact: Contact
     timeout: float | None = None
     doing: str = "the call"
-    """What the operation is, for the message of `WaitTimeout`."""
+    """Name of the operation in the message of `WaitTimeout`."""
 
     failures: int = 0
     failing_since: float = field(default=math.nan)
@@ -79,7 +79,7 @@ class Attempts:
         self.deadline = math.inf if self.timeout is None else self.retries.clock() + self.timeout
 
     def remaining(self) -> float:
-        """Seconds to the deadline; `math.inf` without one.
+        """Return the seconds to the deadline; `math.inf` without one.
 
         Raises
         ------
@@ -95,7 +95,7 @@ class Attempts:
         return left
 
     def answered(self) -> None:
-        """Record that the service answered."""
+        """Record that the service responded."""
         self.contact.made = True
 
     def succeeded(self) -> None:
@@ -113,7 +113,7 @@ class Attempts:
         WaitTimeout
             The deadline would pass during the pause.
         Unreachable, APIStatusError
-            There was no success for too long.
+            No attempt succeeded within the time that `retries` allows.
         """
         now = self.retries.clock()
         if self.failures == 0:
@@ -147,8 +147,8 @@ class Attempts:
 def may_repeat(call: Call, fault: Exception) -> bool:
     """Return True if a call may be sent again after this error.
 
-    A call that is neither idempotent nor has an Idempotency-Key is repeated only if it was certainly not carried out:
-    the connection was not established, or the service answered 429.
+    A call that is neither idempotent nor has an Idempotency-Key is repeated only if it was certainly not executed:
+    the connection was not established, or the service responded with 429.
     """
     if isinstance(fault, httpx.UnsupportedProtocol | httpx.LocalProtocolError):
         return False

@@ -44,7 +44,7 @@ def verified(
     tolerance : float
         Largest difference between the message's time and this machine's, seconds; it prevents replays.
     now : float, optional
-        Seconds since 1970; defaults to the clock's.
+        Current time in seconds since 1970; defaults to the system clock.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Films, or dense 2-D point tracks, of a deforming thing in, a moving 3-D mesh out.
+"""Turn films or dense 2-D point tracks of a deforming object into a moving 3-D mesh.
 
 ``from pliant import Client`` talks to a running service; ``from pliant import solve`` reconstructs in this process. Names are
 loaded on first use, so ``import pliant`` itself loads neither NumPy nor httpx.

@@ -26,18 +26,18 @@ from pliant.worker.tokens import Tokens
 _log = logging.getLogger("pliant.service")
 
 KEEP_ALIVE = 75
-"""Seconds that an idle connection is kept: longer than proxies keep theirs (usually 60 s) and than clients pause between requests, so
-that no request meets a connection that is just being closed."""
+"""Seconds that an idle connection is kept open: longer than proxies keep theirs (usually 60 s) and than clients pause between
+requests, so that no request arrives on a connection that is just being closed."""
 
 STOP_WITHIN = 10
-"""Seconds that running requests get after SIGTERM."""
+"""Seconds that running requests have to finish after SIGTERM."""
 
 
 class Server(uvicorn.Server):
     """A server that notifies the application when it stops, so that event streams can end.
 
-    The notification runs on the event loop. In the signal's handler, which runs between any two steps of a stream, it could
-    fall between a stream's check for the end and its wait; the stream would then wait on and be cut off.
+    The notification runs on the event loop. A signal handler could run between a stream's check for shutdown and its wait; the
+    stream would miss the notification and be cut off.
     """
 
     def __init__(self, config: uvicorn.Config, *, on_stop: Callable[[], None]) -> None:
@@ -58,7 +58,7 @@ def stop_streams(app: FastAPI) -> None:
 
 
 def check_access(settings: ServiceSettings, tokens: Tokens) -> None:
-    """Refuse to start if tokens are required and none is valid: nobody could use the service.
+    """Refuse to start if tokens are required and none is valid, because nobody could use the service.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The application: routes, middleware and the table of errors, assembled."""
+"""The assembly of the application: routes, middleware and the table of errors."""
 
 from __future__ import annotations
 
@@ -65,9 +65,9 @@ STATUS_OF: dict[type[Exception], int] = {
 def create_app(
     jobs_of_all: Jobs, settings: ServiceSettings, *, tokens: Tokens, limits: Limits | None = None
 ) -> FastAPI:
-    """Return the application on the jobs of all owners, whose store is not used before the first request.
+    """Return the application for the jobs of all owners; it does not use their store before the first request.
 
-    `limits` are the largest inputs that the readers accept; None: the usual limits, with `read_memory` of the jobs' settings.
+    `limits` bounds the inputs that the readers accept; None: the default limits, with `read_memory` from the jobs' settings.
     """
     metrics = Metrics()
     limits = limits or Limits(read_memory=jobs_of_all.settings.read_memory)
@@ -95,7 +95,7 @@ def create_app(
 async def _parts(
     app: FastAPI, jobs_of_all: Jobs, settings: ServiceSettings, *, limits: Limits, metrics: Metrics
 ) -> AsyncIterator[None]:
-    """Make what the routes use when the application starts; close it at the end."""
+    """Create the state that the routes use when the application starts; close it at shutdown."""
     incoming = Incoming(jobs_of_all.settings.incoming)
     incoming.open()
     app.state.service = Service(
@@ -146,7 +146,7 @@ def middleware(settings: ServiceSettings, tokens: Tokens, metrics: Metrics, reco
                 ],
             )
         )
-    # Inside CORS: a browser's preflight carries no token, and a page of an allowed origin may read a refusal.
+    # Inside CORS: a browser's preflight has no token, and pages of allowed origins must be able to read a refusal.
     stack.append(Middleware(Authentication, settings=settings, tokens=tokens, records=records))
     stack.append(Middleware(RateLimit, settings=settings))
     return stack

@@ -1,4 +1,4 @@
-"""What routes depend on: one record of the application, and the jobs, uploads and limits of the request's token."""
+"""Dependencies of the routes: the application's state, and the jobs, uploads and limits of the request's token."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from pliant.worker.uploads.service import Uploads
 
 @dataclass(frozen=True)
 class Service:
-    """The parts of an application that outlive a request."""
+    """The state of an application, which all requests share."""
 
     jobs: Jobs
     """The jobs of all owners; routes use `Mine` instead."""
     settings: ServiceSettings
     limits: Limits
-    """What the readers accept."""
+    """Largest inputs that the readers accept."""
     incoming: Incoming
     followers: Followers
     uploads: Uploads
@@ -33,11 +33,11 @@ class Service:
     upload_locks: UploadLocks
     metrics: Metrics
     parsing: ParserSlots
-    """Limits the inputs that are in memory at once."""
+    """Limits the number of inputs in memory at once."""
 
 
 def service_of(request: Request) -> Service:
-    """Return the record of the request's application."""
+    """Return the state of the request's application."""
     service = request.app.state.service
     assert isinstance(service, Service)
     return service
@@ -45,7 +45,7 @@ def service_of(request: Request) -> Service:
 
 @dataclass(frozen=True)
 class Bounds:
-    """The limits of a request's token, the service's where the token has none. 0 means no limit."""
+    """The limits of a request's token, or the service's defaults where the token has none. 0 means no limit."""
 
     max_body_bytes: int
     max_upload_bytes: int
@@ -75,7 +75,7 @@ def bounds_of(request: Request) -> Bounds:
 
 
 def mine(request: Request) -> Jobs:
-    """Return the jobs that the request's token may see: its own, or all where tokens are off."""
+    """Return the jobs that the request's token may see: its own, or all for an `admin` token and with tokens off."""
     owner = request.scope.get("pliant.owner")
     token = request.scope.get("pliant.token")
     return replace(
@@ -87,7 +87,7 @@ def mine(request: Request) -> Jobs:
 
 
 def my_uploads(request: Request) -> Uploads:
-    """Return the uploads of the request's token, or all where tokens are off."""
+    """Return the uploads of the request's owner; with tokens off all requests have the same owner."""
     return service_of(request).uploads.of(request.scope.get("pliant.owner") or "")
 
 

@@ -1,7 +1,7 @@
-"""Following jobs: one reader thread in a process, however many clients follow however many jobs.
+"""Event streams of jobs: a single reader thread per process serves any number of followers and jobs.
 
-The reader waits for the ids of changed jobs (`Records.changes`), reads the new events of those that are followed here, and hands
-them to the followers. A thousand followers of one job cost one read for each change; a job without changes costs nothing.
+The reader waits for the ids of changed jobs (`Records.changes`), reads the new events of jobs that are followed here, and passes
+them to the followers. A thousand followers of one job cost one read per change, plus one every `READ_AGAIN` seconds.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from pliant.worker.records import Changes, Event, Records
 from starlette.concurrency import run_in_threadpool
 
 KEPT = 256
-"""Events that are held for followers that are slow."""
+"""Events of a job that are kept for slow followers."""
 
 WAIT = 1.0
-"""Seconds the reader waits for a change before it looks whether anybody still follows."""
+"""Seconds that the reader waits for a change before it checks whether it should stop."""
 
 WOKEN_AT_ONCE = 25
-"""Followers that are woken in one turn of the event loop: between two turns it serves other requests, which would otherwise wait
-until the last of a thousand followers has been written to."""
+"""Followers that are woken per iteration of the event loop. It serves other requests between iterations; otherwise they would
+wait until the last of a thousand followers has been written to."""
 
 READ_AGAIN = 10.0
-"""Seconds after which every followed job is read again: a change's message is lost while a connection is re-established."""
+"""Seconds between reads of every followed job, because notifications are lost while a connection is re-established."""
 
 
 class Followers:
@@ -45,11 +45,11 @@ class Followers:
 
     @property
     def watched(self) -> int:
-        """Return how many jobs are followed now."""
+        """Number of jobs that are followed now."""
         return len(self._watchers)
 
     def close(self) -> None:
-        """End every following, so that the server can stop."""
+        """End all event streams, so that the server can stop."""
         self.closing.set()
         for watcher in self._watchers.values():
             watcher.wake()
@@ -58,14 +58,14 @@ class Followers:
     async def follow(
         self, jobs: Jobs, id: str, *, after: str | None = None, heartbeat: float = 15.0
     ) -> AsyncGenerator[Event | None]:
-        """Yield a job's events after the last one known, None when `heartbeat` seconds passed without one; ends at a final status.
+        """Yield a job's events after the event `after`, and None whenever `heartbeat` seconds pass without one, until its end.
 
         Raises
         ------
         UnknownJob
             There is no such job, or it was deleted meanwhile.
         InvalidRequest
-            `after` is no event's id.
+            `after` is not the id of an event.
         """
         watcher = self._watchers.setdefault(id, _Watcher())
         watcher.listeners += 1
@@ -98,7 +98,7 @@ class Followers:
                 self._stop_reader()
 
     async def wait(self, jobs: Jobs, id: str, seconds: float) -> Job:
-        """Return the job once its status is final, or as it is after so many seconds."""
+        """Return the job once its status is final, or after `seconds` as it is then."""
         job = await run_in_threadpool(jobs.get, id)
         if job.status.final or seconds <= 0:
             return job
@@ -122,7 +122,7 @@ class Followers:
 
 
 class _Reader(threading.Thread):
-    """The thread that waits for changes and reads events. Everything it finds is handed over on the event loop."""
+    """The thread that waits for changes and reads events. It passes results to followers on the event loop."""
 
     def __init__(self, records: Records, watchers: dict[str, _Watcher], loop: asyncio.AbstractEventLoop) -> None:
         super().__init__(name="events", daemon=True)
@@ -132,14 +132,14 @@ class _Reader(threading.Thread):
         self._loop = loop
 
     def run(self) -> None:
-        """Read until nobody follows a job or the store does not answer."""
+        """Read until no job is followed or the store does not answer."""
         try:
             changes = self._records.changes()
             try:
                 self._follow(changes)
             finally:
                 changes.close()
-        except Exception as error:  # noqa: BLE001 - handed to every follower, who raises it in its own request
+        except Exception as error:  # noqa: BLE001 - passed to every follower, which raises it in its own request
             for watcher in list(self._watchers.values()):
                 self._hand_over(watcher.fail, error)
 
@@ -171,7 +171,7 @@ class _Reader(threading.Thread):
 
 
 class _Watcher:
-    """One job that is followed: its latest events, and the followers that wait for the next."""
+    """A job that is followed: its latest events, and the followers that wait for the next event."""
 
     def __init__(self) -> None:
         self.listeners = 0
@@ -192,20 +192,20 @@ class _Watcher:
         self.wake()
 
     def wake(self) -> None:
-        """Wake the followers, some in each turn of the event loop."""
+        """Wake the followers, `WOKEN_AT_ONCE` per iteration of the event loop."""
         waiting, self._waiting = self._waiting, {}
         self._wake_some(deque(waiting))
 
     def _wake_some(self, waiting: deque[asyncio.Future[None]]) -> None:
         for _ in range(min(WOKEN_AT_ONCE, len(waiting))):
             follower = waiting.popleft()
-            if not follower.done():  # it may have given up meanwhile
+            if not follower.done():  # it may have timed out meanwhile
                 follower.set_result(None)
         if waiting:
             asyncio.get_running_loop().call_soon(self._wake_some, waiting)
 
     def newer(self, last: str) -> list[Event]:
-        """Return the events after one."""
+        """Return the kept events after the event `last`."""
         known, found = _order(last), []
         for event in reversed(self._events):
             if _order(event.id) <= known:
@@ -214,7 +214,7 @@ class _Watcher:
         return found[::-1]
 
     async def changed(self, seconds: float) -> bool:
-        """Wait for the next event; False if none came in this time."""
+        """Wait for the next event; return False if none arrives within `seconds`."""
         follower: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._waiting[follower] = None
         try:
@@ -229,7 +229,7 @@ class _Watcher:
 
 @lru_cache(maxsize=KEPT)
 def is_final(event: Event) -> bool:
-    """Return True if nothing follows this event."""
+    """Return True if this is a job's last event."""
     return event.name == "job" and Job.model_validate_json(event.data).status.final
 
 

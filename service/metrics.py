@@ -19,10 +19,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 __all__ = ["MEDIA_TYPE", "CountRequests", "Metrics"]
 
 ANSWER_SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
-"""Upper bounds of the histogram of the time until an answer begins, in seconds."""
+"""Upper bounds of the histogram of the time until a response begins, in seconds."""
 
 FAILURES = ("internal_error", "out_of_memory", "storage_failed", "timed_out", "worker_lost")
-"""Codes of failures that alerts count. Counters of known labels begin at 0, since a rate does not see a counter's first value."""
+"""Error codes that alerts count. Counters of known labels start at 0, because a rate ignores a counter's first value."""
 
 WEBHOOKS = ("delivered", "given_up", "tried")
 
@@ -30,7 +30,7 @@ METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 
 
 class Metrics:
-    """The collectors of one application, in a registry of their own."""
+    """The collectors of one application, in their own registry."""
 
     def __init__(self) -> None:
         prometheus_client.disable_created_metrics()  # type: ignore[no-untyped-call]
@@ -53,25 +53,25 @@ class Metrics:
         )
 
     def count(self, method: str, route: str, *, status: int, seconds: float) -> None:
-        """Count an answer."""
+        """Count a response."""
         self.answers.labels(method if method in METHODS else "other", route, str(status)).inc()
         self.seconds.labels(route).observe(seconds)
 
     def exposition(self, jobs: Jobs) -> bytes:
-        """Return all metrics, of the jobs of all owners, in Prometheus' text format. Blocks; call it on a thread."""
+        """Return all metrics, for the jobs of all owners, in Prometheus' text format. Blocks; call it on a thread."""
         of_store = CollectorRegistry()
         of_store.register(StoreCollector(jobs))
         return prometheus_client.generate_latest(of_store) + prometheus_client.generate_latest(self.registry)
 
 
 class StoreCollector(Collector):
-    """Reads the state of an installation from its store; while the store does not answer, only `pliant_store_up` 0."""
+    """Collects the state of an installation from its store; without an answer of the store, only `pliant_store_up` 0."""
 
     def __init__(self, jobs: Jobs) -> None:
         self._jobs = jobs
 
     def describe(self) -> Iterable[Metric]:
-        """Return nothing: registering must not read the store."""
+        """Return nothing, because registering must not read the store."""
         return []
 
     def collect(self) -> Iterable[Metric]:
@@ -118,7 +118,7 @@ def _counter(
 
 
 def _durations(tallies: Mapping[str, float]) -> Metric:
-    """Return the histogram of run times: the store counts per bucket; in Prometheus each bucket includes all below it."""
+    """Return the histogram of run times. The store counts per bucket; in Prometheus each bucket includes all lower ones."""
     text = "Run time of jobs' last attempts, by final status."
     family = HistogramMetricFamily("pliant_job_run_seconds", text, labels=["status"])
     for status in (each.value for each in Status if each.final):
@@ -132,12 +132,12 @@ def _durations(tallies: Mapping[str, float]) -> Metric:
 
 
 def _group(tallies: Mapping[str, float], group: str) -> dict[str, float]:
-    """Return the tallies of a group by what follows the group's name."""
+    """Return the tallies of a group, without the group's prefix in their names."""
     return {name.removeprefix(f"{group}:"): value for name, value in tallies.items() if name.startswith(f"{group}:")}
 
 
 class CountRequests:
-    """ASGI middleware that counts every answer by the route's pattern, never by the path, which clients choose."""
+    """ASGI middleware that counts every response by the route's pattern rather than by the path, which clients choose."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._app = app
@@ -145,7 +145,7 @@ class CountRequests:
         self._clock = clock
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, and count its answer when it begins."""
+        """Pass the request on, and count its response when it begins."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -167,10 +167,10 @@ class CountRequests:
             try:
                 await self._app(scope, receive, watched)
             except Exception:
-                count(500)  # the answer to an unexpected exception is made outside of this middleware
+                count(500)  # the response to an unexpected exception is created outside of this middleware
                 raise
 
 
 def _route(scope: Scope) -> str:
-    """Return the pattern of the route that answers, `other` where there is none."""
+    """Return the pattern of the route that handled the request, or `other` without one."""
     return str(getattr(scope.get("route"), "path", None) or "other")

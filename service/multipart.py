@@ -1,7 +1,7 @@
-"""Receive a multipart form: parts are streamed to files with a size limit and a SHA-256, never held in memory.
+"""Receive a multipart form: file parts are streamed to disk with a size limit and a SHA-256, never held in memory.
 
-FastAPI's `UploadFile` reads the whole body into a temporary file before the route is entered, and the route copies it again;
-here the body is parsed as it arrives, in batches on a thread, so a 300 MB part costs one write and a few hundred kilobytes.
+FastAPI's `UploadFile` reads the whole body into a temporary file before the route is entered, and the route copies it again.
+Here a thread parses the body in batches as it arrives, so a 300 MB part is written once and takes a few hundred kilobytes of memory.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect, Request
 
 LONGEST_FILE_NAME = 200
-"""Characters of a file's name that are kept, as many as of a job's name."""
+"""Maximum length of a file's name, characters, the same as for a job's name; longer names are truncated."""
 
 BATCH = 2**18
-"""Bytes gathered before a thread parses and writes them: a hop costs some 50 µs, so smaller batches would be mostly hops."""
+"""Bytes gathered before a thread parses and writes them; the switch costs about 50 µs, which would dominate smaller batches."""
 _SUFFIX = re.compile(r"\.[a-z0-9]{1,8}")
 
 
@@ -37,11 +37,11 @@ class FormRules:
     Attributes
     ----------
     files : frozenset of str
-        Parts that are written to disk when they come with a file name.
+        Parts that are written to disk if they have a file name.
     texts : frozenset of str
-        Parts that may be text; one that is in `files` too is text when it has no file name.
+        Parts that may be text; a part that is also in `files` is text if it has no file name.
     max_body_bytes, max_text_bytes : int
-        Limits of the whole body and of one text.
+        Limits on the complete body and on one text.
     stall_seconds : float
         Seconds without a byte after which the request is refused.
     """
@@ -61,7 +61,7 @@ class File:
     bytes: int
     sha256: str
     name: str = ""
-    """The user's name of the file, without its folder; empty where the request has none."""
+    """File name that the client sent, without its folder; empty if there is none."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Form:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 over every part's name and content, the same for the same content in any order of the parts."""
+        """SHA-256 over every part's name and content, independent of the order of the parts."""
         parts = {name: ["file", file.sha256] for name, file in self.files.items()}
         parts |= {name: ["text", text] for name, text in self.texts.items()}
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
@@ -85,7 +85,7 @@ async def receive_form(request: Request, folder: Path, *, rules: FormRules) -> F
     Raises
     ------
     Refusal
-        415 no multipart form, 400 malformed or cut short, 413 too large, 408 stalled, 422 an unknown or repeated part.
+        415: not a multipart form; 400: malformed or incomplete; 413: too large; 408: stalled; 422: unknown, repeated or invalid part.
     """
     kind, parameters = parse_options_header(request.headers.get("content-type"))
     if kind != b"multipart/form-data":
@@ -110,14 +110,14 @@ async def receive_form(request: Request, folder: Path, *, rules: FormRules) -> F
 
 
 async def batches(request: Request, *, max_bytes: int, stall_seconds: float) -> AsyncIterator[bytes]:
-    """Yield the body, which has not been read yet, in pieces of about `BATCH` bytes.
+    """Yield the unread body in pieces of about `BATCH` bytes.
 
     Raises
     ------
     Refusal
-        413 if the body is declared or turns out larger than `max_bytes`, 408 if no byte comes for `stall_seconds`.
+        413: the declared or actual size exceeds `max_bytes`; 408: no byte arrives for `stall_seconds`.
     ClientDisconnect
-        The body breaks off, after what has arrived of it.
+        The body is incomplete; the bytes that have arrived are yielded first.
     """
     declared = request.headers.get("content-length", "")
     if declared.isdigit() and int(declared) > max_bytes:
@@ -133,7 +133,7 @@ async def batches(request: Request, *, max_bytes: int, stall_seconds: float) -> 
             detail = f"No byte of the body arrived for {stall_seconds:g} s. Send the request again."
             raise Refusal(ProblemCode.BODY_STALLED, detail=detail) from None
         except ClientDisconnect:
-            if gathered:  # an upload keeps what has arrived
+            if gathered:  # uploads keep the bytes that have arrived
                 yield b"".join(gathered)
             raise
         if piece is None:
@@ -197,7 +197,7 @@ class _Reader:
             raise _malformed(str(error)) from error
 
     def finish(self) -> Form:
-        """Return the form, once all of the body was fed."""
+        """Return the form, after the complete body was fed."""
         if not self._ended:
             raise _malformed("it ends before its closing boundary")
         return Form(files=self._files, texts=self._texts)
@@ -285,7 +285,7 @@ class _Reader:
 
 
 def own_name(given: str) -> str:
-    """Return the last component of a file name that a client sent, on one line and not longer than file systems allow."""
+    """Return the last component of a client's file name, on one line and with at most `LONGEST_FILE_NAME` characters."""
     last = given.replace("\\", "/").rpartition("/")[2]
     return "".join(each if each.isprintable() else " " for each in last)[:LONGEST_FILE_NAME].strip()
 

@@ -1,4 +1,4 @@
-"""The parts of the OpenAPI document that FastAPI cannot read from the code: errors, examples, tags, the form."""
+"""The parts of the OpenAPI document that FastAPI cannot derive from the code: errors, examples, tags, the form."""
 
 from __future__ import annotations
 
@@ -89,8 +89,8 @@ SUBMIT_BODY: dict[str, Any] = {
         "multipart/form-data": {
             "schema": {
                 "type": "object",
-                # Tracks, the upload that holds them, a film, or the inputs of an earlier job.
-                # Generators of clients cannot read an anyOf in its place.
+                # Tracks, an upload of tracks, a film, or the inputs of an earlier job are required.
+                # Client generators do not support an anyOf here.
                 "if": {
                     "not": {
                         "anyOf": [
@@ -133,7 +133,7 @@ SUBMIT_BODY: dict[str, Any] = {
                     },
                     "inputs_of": {
                         "type": "string",
-                        "description": "Instead of files: the id of a job of yours, whose inputs are used again with these options.",
+                        "description": "Instead of files: the id of one of your jobs, whose inputs are used again with these options.",
                     },
                     "name": {"type": "string", "maxLength": 200, "description": "A label of your own."},
                     "webhook": {
@@ -197,13 +197,13 @@ _ERROR_HEADERS = {
     503: ("Retry-After", "Seconds to wait."),
 }
 _EVERYWHERE = (421, 500)
-"""Errors of any path: an unknown Host, an internal error."""
+"""Errors of any path: unknown Host, internal error."""
 _WITH_TOKEN = (401, 403, 429, 503)
-"""Further errors of paths that need a token: none or an invalid one, missing scope, rate limit, no store to verify it."""
+"""Further errors of paths that need a token: missing or invalid token, missing scope, rate limit, unavailable token store."""
 
 
 def document(app: FastAPI) -> dict[str, Any]:
-    """Return the OpenAPI document: FastAPI's, with the errors of middleware and the schemas that routes only refer to."""
+    """Return FastAPI's OpenAPI document, with the errors of middleware and the schemas that routes only refer to."""
     if app.openapi_schema is None:
         made = FastAPI.openapi(app)
         schemas = made.setdefault("components", {}).setdefault("schemas", {})
@@ -220,7 +220,7 @@ def document(app: FastAPI) -> dict[str, Any]:
             "type": "string",
             "enum": [code.value for code in ProblemCode],
         }
-        # The schema of a request: every option may be left out.
+        # The schema of a request, in which every option may be omitted.
         schemas["Options"] = Options.model_json_schema(ref_template=_REF)
         for model in (OutputRequest, ShareRequest):
             schemas[model.__name__] = model.model_json_schema(ref_template=_REF)

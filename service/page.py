@@ -45,9 +45,9 @@ NOT_BUILT = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Plian
 
 
 class PageFiles(StaticFiles):
-    """Static files of the page: only the types of `MEDIA_TYPES`, the gzip twin of a file where the client accepts it.
+    """Static files of the page: only the types of `MEDIA_TYPES`, compressed with gzip if the client accepts it.
 
-    File names other than those of HTML documents contain a hash of the content, so they never change.
+    Except for HTML documents, file names contain a hash of the content, so a file with a given name never changes.
     """
 
     def file_response(
@@ -71,14 +71,14 @@ class PageFiles(StaticFiles):
         )
         if self.is_not_modified(response.headers, requested):
             unchanged = NotModifiedResponse(response.headers)
-            # A browser replaces the headers it has stored by those of the 304, so the page's policy must be among them.
+            # Browsers replace their stored headers by those of the 304, so it must include the page's policy.
             unchanged.headers.update(HEADERS)
             return unchanged
         return response
 
 
 def mount_page(app: FastAPI, directory: Path = BUILT) -> None:
-    """Serve the built page. Without one, `/`, `/guide` and `/docs` answer 503 with how to build it."""
+    """Serve the built page. Without one, `/`, `/guide` and `/docs` return 503 with build instructions."""
     files = PageFiles(directory=directory, check_dir=False)
     files.config_checked = True  # the page can be built while the service runs
 

@@ -1,4 +1,4 @@
-"""Every error as RFC 9457 problem details, made in one place.
+"""The conversion of every error to RFC 9457 problem details.
 
 A table maps each class of exception to a status code; code, field, expected, got and hint are attributes of the exception.
 FastAPI's own errors (404, 405, 422) are converted the same way, so a client needs one parser.
@@ -47,9 +47,9 @@ class Refusal(Exception):
     code : ProblemCode
         Stable machine-readable name of the error.
     detail : str
-        A whole sentence that ends with what to do next.
+        A complete sentence that ends with what to do next.
     status : int
-        The HTTP status code; the code's usual one if none is given.
+        The HTTP status code; by default the code's usual one.
     members : dict
         Further members of `Problem`: ``field``, ``expected``, ``got``, ``hint``, ``choices``, ``type``.
     headers : dict of str to str
@@ -74,7 +74,7 @@ class Refusal(Exception):
 
 
 class ProblemResponse(Response):
-    """The response that carries a problem document; leaves the code in the request's scope, where the access log reads it."""
+    """A response with a problem document; it stores the code in the request's scope for the access log."""
 
     media_type = MEDIA_TYPE
 
@@ -91,12 +91,12 @@ class ProblemResponse(Response):
 
 
 def wrong_input(code: ProblemCode, *, field: str, expected: str, got: str, hint: str, **more: Any) -> Refusal:
-    """Return (not raise) the refusal of an input; `more` goes to `Refusal`."""
+    """Return (not raise) the refusal of an input; `more` is passed to `Refusal`."""
     return refused(Invalid(code, field=field, expected=expected, got=got, hint=hint), **more)
 
 
 def refused(error: Invalid, **more: Any) -> Refusal:
-    """Return the refusal that an error about an invalid value amounts to; `more` goes to `Refusal`."""
+    """Return the refusal for an error about an invalid value; `more` is passed to `Refusal`."""
     return Refusal(ProblemCode[error.code.upper()], detail=str(error), **{**members_of(error), **more})
 
 
@@ -108,9 +108,9 @@ def answer(
     status: int | None = None,
     **members: Any,
 ) -> ProblemResponse:
-    """Return the response for a code, which gives type, title and, unless `status` is given, the status.
+    """Return the response for a code, which determines type, title and, unless `status` is given, the status.
 
-    `detail` is a whole sentence that ends with what to do; `members` are further ones of `Problem`.
+    `detail` is a complete sentence that ends with what to do; `members` are further members of `Problem`.
     """
     return ProblemResponse(Problem.of(code, status, detail=detail, **members), headers=headers)
 
@@ -122,9 +122,9 @@ def from_error(error: Exception, status: int) -> Problem:
 
 
 def from_validation(errors: Sequence[Any], *, options: bool = False) -> Refusal:
-    """Return the refusal of values that pydantic rejected: the first fault in full, the others counted.
+    """Return the refusal of values that pydantic rejected: the first error in full, and the number of others.
 
-    They are the options of a job or parameters of the request.
+    The values are a job's options if `options` is True, else parameters of the request.
     """
     first = errors[0]
     where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", "header")]
@@ -157,8 +157,8 @@ def _short(value: object) -> str:
 def install(app: FastAPI, table: Mapping[type[Exception], int], *, security_headers: Mapping[str, str]) -> None:
     """Answer every error of the app with a problem document.
 
-    The table has status codes by class; a subclass that is not listed uses its nearest base's. The security headers are for the
-    answer to an unexpected exception, which is made outside all middleware.
+    `table` maps error classes to status codes; a subclass that is not listed uses its nearest base's. `security_headers` are for
+    the response to an unexpected exception, which is created outside all middleware.
     """
     app.add_exception_handler(Refusal, _of_refusal)
     app.add_exception_handler(HTTPException, _of_http)
@@ -190,7 +190,7 @@ async def _of_validation(request: Request, error: Exception) -> Response:
 
 
 async def _of_disconnect(_: Request, __: Exception) -> Response:
-    # For the access log: nobody is left to read the answer.
+    # Only for the access log: the client has disconnected.
     return answer(
         ProblemCode.BAD_REQUEST, detail="The connection closed before the body was complete. Nothing was kept."
     )
@@ -215,7 +215,7 @@ async def _of_disk(request: Request, error: Exception, security_headers: Mapping
 
 
 async def _unforeseen(request: Request, error: Exception, security_headers: Mapping[str, str]) -> Response:
-    # Starlette raises it again after this answer, so the server's log has the traceback; the client never sees it.
+    # Starlette raises the error again after this response, so the server's log has the traceback; the client never sees it.
     _log.error("unexpected %s in %s %s", type(error).__name__, request.method, request.url.path)
     code, detail = _BY_STATUS[500]
     kept: dict[str, str] = request.scope.get("pliant.log", {})

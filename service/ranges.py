@@ -1,4 +1,4 @@
-"""Conditional and ranged reading of one file (RFC 9110, sections 13 and 14), as pure functions of the request's headers."""
+"""Conditional and range requests for one file (RFC 9110, sections 13 and 14), as pure functions of the request's headers."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ _TAG = re.compile(r'(?:W/)?"[^"]*"')
 
 @dataclass(frozen=True)
 class Slice:
-    """What to send of a file: `length` bytes from `start` on, and the status of the answer."""
+    """The bytes of a file to send, `length` of them from `start` on, and the status of the response."""
 
     status: int
-    """200 whole, 206 a part, 304 nothing because the client has it, 412 not the file it meant, 416 no such part."""
+    """200: the whole file; 206: a range; 304: the client has the file; 412: the client expects another file; 416: invalid range."""
     start: int = 0
     length: int = 0
 
 
 def decide(headers: Mapping[str, str], *, size: int, etag: str) -> Slice:
-    """Return what a GET with these headers is to be answered with; `etag` is the file's strong entity tag, with its quotes.
+    """Return status and bytes of the response to a GET with these headers; `etag` is the strong entity tag, with its quotes.
 
-    Preconditions come first (If-Match, If-None-Match), then Range if If-Range agrees. Several ranges at once are answered with
-    the whole file, as RFC 9110 §14.2 allows: nobody resumes a download that way.
+    Preconditions come first (If-Match, If-None-Match), then Range if If-Range matches. A request for several ranges gets the
+    whole file, as RFC 9110 §14.2 allows, because resuming a download needs only one.
     """
     if "if-match" in headers and not _matches(headers["if-match"], etag, strong=True):
         return Slice(412)
     if "if-none-match" in headers and _matches(headers["if-none-match"], etag, strong=False):
         return Slice(304)
     wanted = headers.get("range")
-    # If-Range with a date never agrees: we give no Last-Modified, so the client cannot have one of ours.
+    # If-Range with a date never matches, because responses have no Last-Modified.
     if wanted is None or headers.get("if-range", etag).strip() != etag:
         return Slice(200, 0, size)
     return _of_range(wanted, size)
 
 
 def _of_range(wanted: str, size: int) -> Slice:
-    """Return the part that a Range header names; a header that is no single byte range is ignored."""
+    """Return the bytes for a Range header, which is ignored unless it is a single byte range."""
     match = _ONE_RANGE.fullmatch(wanted)
     if match is None or match.groups() == ("", ""):
         return Slice(200, 0, size)
@@ -55,7 +55,7 @@ def _of_range(wanted: str, size: int) -> Slice:
 
 
 def _matches(listed: str, etag: str, *, strong: bool) -> bool:
-    """Return True if an If-Match or If-None-Match list names this entity tag."""
+    """Return True if an If-Match or If-None-Match list contains this entity tag."""
     if listed.strip() == "*":
         return True
     tags = _TAG.findall(listed)

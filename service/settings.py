@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 MB = 2**20
 
 USUAL_RATE = 1200
-"""Requests in a minute: twenty a second, with a minute's worth at once."""
+"""Default rate limit: 1200 requests per minute, i.e. 20 per second on average, all of which may arrive at once."""
 
 Auth = Literal["auto", "required", "off"]
 
@@ -23,12 +23,12 @@ def _split(given: object) -> object:
     return tuple(part.strip() for part in given.split(",") if part.strip()) if isinstance(given, str) else given
 
 
-Listed = Annotated[tuple[str, ...], BeforeValidator(_split), Field(description="names, commas between them")]
+Listed = Annotated[tuple[str, ...], BeforeValidator(_split), Field(description="names, separated by commas")]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServiceSettings:
-    """How the service runs. A field NAME is read from the variable PLIANT_NAME."""
+    """Settings of the service. A field NAME is read from the variable PLIANT_NAME."""
 
     host: str = "127.0.0.1"
     """Address to bind."""
@@ -39,37 +39,37 @@ class ServiceSettings:
     max_text_bytes: int = Field(default=1 * MB, ge=1)
     """Largest text field of a form, or whole JSON body, in bytes."""
     max_queued: int = Field(default=1000, ge=0, le=10**7)
-    """Queued jobs of one token, unless the token has a limit of its own; 0: no limit. Where tokens are off, all jobs count as
-    one token's."""
+    """Maximum number of queued jobs per token, unless the token has its own limit; 0: no limit. With tokens off, the limit
+    applies to all jobs together."""
     requests_per_minute: int | None = Field(default=None, ge=0, le=10**7)
-    """Requests per minute of one token, or of one address where tokens are off; 0: no limit; None: `USUAL_RATE` where the
-    service is not on the loopback address or requires tokens, no limit elsewhere."""
+    """Maximum number of requests per minute per token, or per address with tokens off; 0: no limit; None: 1200 if the service is
+    not on the loopback address or requires tokens, else no limit."""
     parsers: int = Field(default=2, ge=1, le=64)
-    """Bodies that are parsed at once; each may hold a whole input in memory."""
+    """Number of bodies that are parsed at once; each may take the memory of a complete input."""
     stall_seconds: float = Field(default=60.0, gt=0)
     """Seconds without a byte of an unfinished body after which the request is refused."""
     max_wait_seconds: int = Field(default=60, ge=0)
-    """Longest `Prefer: wait=n` that is honoured, in seconds."""
+    """Longest wait that `Prefer: wait=n` can request, in seconds."""
     heartbeat_seconds: float = Field(default=15.0, gt=0)
-    """Pause after which an event stream sends a comment line, in seconds."""
+    """Seconds without an event after which an event stream sends a comment line."""
     allowed_hosts: Listed = ()
-    """Values of the Host header that are answered, separated by commas. Empty: on the loopback address
-    its usual names, on another address any."""
+    """Accepted values of the Host header, separated by commas. Empty: the names of the loopback address if the service is
+    bound to it, else any."""
     auth: Auth = "auto"
     """Whether a request needs a token: `required`, `off`, or `auto`, which is off on the loopback address and required on any
     other."""
     cors_origins: Listed = ()
     """Origins whose pages may call the service, separated by commas; empty: none."""
     trusted_proxies: Listed = ()
-    """Addresses or networks of proxies whose `X-Forwarded-For` names the client, separated by commas; `*` for
-    any. Empty: none, because any user of the machine could choose the address that is counted."""
+    """Addresses or networks of proxies whose `X-Forwarded-For` is trusted, separated by commas; `*` for any. Empty: none,
+    because any user of the machine could otherwise choose the address to which rate limits apply."""
     presigned_redirects: bool = True
-    """Whether downloads that accept it (`?redirect=true`) are redirected to S3 by a URL that is valid for five minutes. False where
-    clients cannot reach the object store. Without S3 it has no effect."""
+    """Whether downloads that accept it (`?redirect=true`) are redirected to a presigned S3 URL, valid for five minutes. Disable it
+    if clients cannot reach the object store. No effect without S3."""
     log_level: LogLevel = "info"
-    """Least level that is logged."""
+    """Lowest level that is logged."""
     log_format: LogFormat = "console"
-    """`console` for people, `json` for one JSON object a line."""
+    """`console` for people, `json` for one JSON object per line."""
 
     @classmethod
     def from_environment(cls) -> ServiceSettings:
@@ -87,7 +87,7 @@ class ServiceSettings:
         return self.auth == "required" or (self.auth == "auto" and not self.loopback)
 
     def rate_of(self, own: int | None) -> int:
-        """Return the requests per minute that a token with this limit of its own may send, 0 for no limit."""
+        """Return the requests per minute that a token with its own limit `own` may send; 0 means no limit."""
         if own is not None:
             return own
         if self.requests_per_minute is not None:

@@ -1,4 +1,4 @@
-"""The spool: a folder for request bodies while they arrive, empty afterwards; and the slots in which they are parsed.
+"""The spool, a folder for request bodies while they arrive, and the slots in which they are parsed.
 
 Each process owns one sub-folder and locks a file beside it; each request gets a scratch directory in it, removed when the
 request ends. The next process that starts removes sub-folders of killed processes, recognized by their free lock.
@@ -25,7 +25,7 @@ Answer = TypeVar("Answer")
 
 
 class Incoming:
-    """One process's share of the spool; `open` it, `close` it.
+    """The sub-folder of one process in the spool, which exists between `open` and `close`.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Incoming:
             lock = self.directory / f"{name}.lock"
             descriptor = os.open(lock, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
             fcntl.flock(descriptor, fcntl.LOCK_EX)
-            # Another process may have removed the file just before it was locked; then it has no name any more.
+            # Another process may have removed the file just before it was locked.
             if os.fstat(descriptor).st_nlink == 0:
                 os.close(descriptor)
                 continue
@@ -99,12 +99,12 @@ class Incoming:
 
 
 class ParserSlots:
-    """Runs calls on threads, so many at once. A slot that becomes free goes to the waiting owner that holds the fewest.
+    """Runs a limited number of calls at once on threads. A free slot goes to the waiting owner that holds the fewest.
 
     Parameters
     ----------
     total : int
-        Calls at once.
+        Maximum number of calls at once.
     """
 
     def __init__(self, total: int) -> None:
@@ -114,7 +114,7 @@ class ParserSlots:
         self._waiting: OrderedDict[str, deque[anyio.Event]] = OrderedDict()
 
     async def run(self, owner: str, call: Callable[..., Answer], *arguments: object) -> Answer:
-        """Return what the call returns, once a slot is free for its owner."""
+        """Run a call once a slot is free for its owner, and return its result."""
         await self._take(owner)
         try:
             return await to_thread.run_sync(partial(call, *arguments), limiter=self._limiter)
@@ -144,7 +144,7 @@ class ParserSlots:
         if not self._waiting:
             self._free += 1
             return
-        following = min(self._waiting, key=lambda each: self._held[each])  # of equals the first to have come
+        following = min(self._waiting, key=lambda each: self._held[each])  # of equals the first in the queue
         granted = self._waiting[following][0]
         self._leave(following, granted)
         if following in self._waiting:

@@ -34,20 +34,20 @@ OF_TRACKS = ("tracks", "mesh", "ground_truth", "rotations")
 OF_FILM = ("film", "region")
 FILES = frozenset({*OF_TRACKS, *OF_FILM})
 UPLOADS = {f"{part}_upload": part for part in sorted(FILES)}
-"""Text parts that name an upload, and the part that each stands for."""
+"""Text parts with the id of an upload, and the file part that each replaces."""
 KEPT = "inputs_of"
-"""Text part that names a job whose kept inputs are used again."""
+"""Text part with the id of a job whose stored inputs are reused."""
 TEXTS = frozenset({"mesh", "options", "name", "priority", "webhook", "webhook_secret", KEPT, *UPLOADS})
 READING = (
     "layout", "rows", "y_axis", "coordinates", "coordinate_order", "visibility", "frames", "stride", "max_points", "min_seen",
 )  # fmt: skip
-"""Options that say how tracks are read: kept inputs have been read already."""
+"""Options that determine how tracks are read; they cannot change for stored inputs, which have been read already."""
 LONGEST_JOB_NAME = 200
-"""Characters of the user's label."""
+"""Maximum length of the user's label, characters."""
 
 
 def form_rules(settings: ServiceSettings, *, max_body_bytes: int) -> FormRules:
-    """Return what the form of a job may hold; `max_body_bytes` is the limit of the request's token."""
+    """Return the rules for the form of a job; `max_body_bytes` is the limit of the request's token."""
     return FormRules(
         files=FILES,
         texts=TEXTS,
@@ -69,13 +69,12 @@ def accept(
 ) -> tuple[Job, bool]:
     """Read a form's inputs and submit the job; return it, and whether it is new. Blocks; call it on a thread.
 
-    The canonical inputs are written to `folder`, which the caller removes. `limits` are the largest inputs that the readers
-    accept.
+    The canonical inputs are written to `folder`, which the caller removes. `limits` bounds the inputs that the readers accept.
 
     Raises
     ------
     Refusal, InvalidInput, WorkerError
-        Nothing is queued.
+        The job was refused; nothing is queued.
     """
     form = with_uploads(form, folder, uploads)
     fingerprint = form.fingerprint
@@ -110,28 +109,28 @@ def accept(
 
 @dataclass(frozen=True)
 class Kept:
-    """The inputs of an earlier job, to be used again."""
+    """The stored inputs of an earlier job, for reuse."""
 
     job: Job
     form: Form
-    """The form with the earlier job's film, where it had one."""
+    """The form, with the earlier job's film if it had one."""
     options: Options
-    """Those given, with the earlier job's ways of reading its tracks."""
+    """The given options; for tracks, those in `READING` are the earlier job's."""
     canonical: Path | None
     """The tracks as they were read; None for a film, which is tracked again."""
 
 
 def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept | None:
-    """Return the inputs that a form names by the part `inputs_of`; None if it has no such part.
+    """Return the stored inputs of the job in the form's part `inputs_of`; None if the form has no such part.
 
     Raises
     ------
     Refusal
-        The form has files as well, or an option would read kept tracks in another way.
+        The form has files as well, or an option differs from how the stored tracks were read.
     UnknownJob
         There is no such job.
     NotAllowedNow
-        The job holds further files of another one.
+        The job only wrote further files of another one.
     """
     id = form.texts.get(KEPT, "").strip()
     if not id:
@@ -166,7 +165,7 @@ def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept 
 
 
 def with_uploads(form: Form, folder: Path, uploads: Uploads) -> Form:
-    """Return the form with the uploads that it names as files; the same content gives the same form either way.
+    """Return the form with its uploads as files, so that its fingerprint does not depend on how the files were sent.
 
     Raises
     ------
@@ -198,7 +197,7 @@ def with_uploads(form: Form, folder: Path, uploads: Uploads) -> Form:
             hint = "Send the rest first, from the offset that HEAD returns."
             code = ProblemCode[error.code.upper()]
             raise wrong_input(
-                code, field=name, status=422, expected="a complete upload", got="a part of it", hint=hint
+                code, field=name, status=422, expected="a complete upload", got="an incomplete one", hint=hint
             ) from error
         files[part] = File(path, path.stat().st_size, digest, own_name(texts.get("name", "")) if part == "film" else "")
     return Form(files=files, texts=texts)
@@ -206,13 +205,13 @@ def with_uploads(form: Form, folder: Path, uploads: Uploads) -> Form:
 
 @dataclass(frozen=True, slots=True)
 class ReadInputs:
-    """What the files of a form turned out to be."""
+    """The interpretation of a form's files."""
 
     interpretation: Interpretation
     options: Options
-    """Those given, completed by what a film or its tracks state."""
+    """The given options, completed with values from the film or track file."""
     first_frame: str | None = None
-    """Of a film, as a JPEG in base64; None for tracks, or where it was not wanted."""
+    """First frame of a film, as a JPEG in base64; None for tracks, or if it was not requested."""
 
 
 def read_form(
@@ -245,7 +244,7 @@ def read_form(
 
 
 def _read_again(interpretation: Interpretation, options: Options) -> ReadInputs:
-    """Return tracks that an earlier job has read, with what other options of the solve change."""
+    """Return the interpretation of tracks that an earlier job has read, updated for the options of a new solve."""
     size = (interpretation.num_frames, interpretation.num_points)
     kinds_for(options, size=size)
     options = tracks_options(options, interpretation)
@@ -255,7 +254,7 @@ def _read_again(interpretation: Interpretation, options: Options) -> ReadInputs:
 
 
 def _check_film_parts(form: Form) -> None:
-    """Refuse a region without a film, and a film beside parts that belong to tracks."""
+    """Refuse a region without a film, and a film together with parts that belong to tracks."""
     if "film" not in form.files:
         raise missing("film")
     others = [part for part in OF_TRACKS if part in form.files or form.texts.get(part, "").strip()]
@@ -299,7 +298,7 @@ def parse_options(text: str) -> Options:
     Raises
     ------
     Refusal
-        It is no JSON object, names an unknown option, or a value is out of range.
+        The text is not a JSON object, an option is unknown, or a value is invalid.
     """
     if not text.strip():
         return Options()

@@ -22,14 +22,14 @@ class _Lock:
 
 
 class UploadLocks:
-    """The uploads that requests of this process write to."""
+    """The locks of uploads that requests of this process write to."""
 
     def __init__(self) -> None:
         self._held: dict[Hashable, _Lock] = {}
 
     @asynccontextmanager
     async def take(self, what: Hashable) -> AsyncIterator[None]:
-        """Hold the lock of `what` within the block; the request that holds it now is stopped first.
+        """Hold the lock of `what` within the block; a request that already holds it is stopped first.
 
         Raises
         ------
@@ -47,5 +47,5 @@ class UploadLocks:
             del self._held[what]
             mine.ended.set()
         if mine.scope.cancelled_caught:
-            detail = "A newer request writes to the same upload. Ask for its offset before you continue."
+            detail = "A newer request writes to the same upload. Query its offset before you continue."
             raise Refusal(ProblemCode.UPLOAD_TAKEN_OVER, detail=detail)

@@ -1,1 +1,1 @@
-"""Commands with a module of their own, beside those of `pliant.cli`."""
+"""Commands that each have a module, in addition to those in `pliant.cli`."""

@@ -1,4 +1,4 @@
-"""`pliant submit` of several files: a job each, found again when the command is repeated, and a table of how they ended."""
+"""`pliant submit` with several files: one job per file, found again if the command is repeated, and a table of outcomes."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 ENDINGS = frozenset({".npz", ".npy", ".mat", ".h5", ".hdf5", ".csv", ".txt"})
-"""Names that are taken for track files in a folder."""
+"""Extensions of track files in a folder."""
 
 
 def expanded(given: list[Path], region: Path | None) -> list[Path]:
-    """Return the files that folders and patterns stand for, in the order of their names; a folder of pictures is a film.
+    """Replace each folder of track files and each pattern by its files, sorted by name; a folder of pictures is a film.
 
     Raises
     ------
     BadArgument
-        A folder has no track file; a pattern finds nothing or has two asterisks in a row.
+        A folder is empty and there is no region; a pattern matches nothing or contains ``**``.
     """
     from pliant.client.errors import BadArgument
 
@@ -45,7 +45,7 @@ def expanded(given: list[Path], region: Path | None) -> list[Path]:
                 f"{path}: expected track files ({', '.join(sorted(ENDINGS))}), got an empty folder. Name the files."
             )
         elif not path.exists() and any(sign in path.name for sign in "*?["):
-            if "**" in path.name:  # Python before 3.13 raises ValueError, later ones take it for one asterisk
+            if "**" in path.name:  # Python before 3.13 raises ValueError, later versions treat it as one asterisk
                 raise BadArgument(
                     f"{path}: expected a pattern of one folder's files, got **. Write a single * for any characters."
                 )
@@ -59,14 +59,14 @@ def expanded(given: list[Path], region: Path | None) -> list[Path]:
 
 
 def track_files(folder: Path) -> list[Path]:
-    """Return the track files of a folder by name, none if it is no folder or has pictures of a film instead."""
+    """Return the track files of a folder, sorted by name; empty if it has none or is not a folder."""
     if not folder.is_dir():
         return []
     return sorted(each for each in folder.iterdir() if each.suffix.lower() in ENDINGS and each.is_file())
 
 
 def judged(job: Job | None) -> Text:
-    """Return a job's verdict in words, with the first of its reasons; nothing where it was not judged."""
+    """Return a job's verdict with its first reason; empty if it has no verdict."""
     from rich.text import Text
 
     if job is None or job.verdict is None:
@@ -77,7 +77,7 @@ def judged(job: Job | None) -> Text:
 
 @dataclass(slots=True)
 class Row:
-    """A file, and what became of it."""
+    """A file and the outcome of its job."""
 
     file: Path
     job: Job | None = None
@@ -86,19 +86,19 @@ class Row:
 
 @dataclass(slots=True, kw_only=True)
 class Batch:
-    """Several files with the same options."""
+    """Several files that are submitted with the same options."""
 
     files: list[Path]
     shared: dict[str, Any]
     """Further parameters of `Client.submit`."""
     options: dict[str, Any]
     key: str
-    """Distinguishes the batch from others of the same files."""
+    """Distinguishes the batch from others with the same files."""
     priority: str
     timeout: float | None
     output: Path | None
     force: bool
-    """Whether files of other content in the output folders are replaced; else they refuse the download."""
+    """Whether to replace files with different content in the output folders; otherwise they prevent the download."""
     wait: bool
     url: str
     """Address of the service."""
@@ -107,12 +107,12 @@ class Batch:
     rows: list[Row] = field(default_factory=list)
 
     def check(self, *, name: str, job_id: str | None, region: Path | None) -> None:
-        """Refuse options that belong to a single job, and make the output folders.
+        """Refuse options that are only valid for a single job, and create the output folders.
 
         Raises
         ------
         BadArgument
-            One was given, two files have the same name, or a folder cannot be written.
+            Such an option was given, a file cannot be read, two files have the same name, or a folder is not writable.
         """
         from pliant.client.errors import BadArgument
         from pliant.client.multipart import existing_file
@@ -120,7 +120,7 @@ class Batch:
         given = [word for word, value in (("--name", name), ("--id", job_id), ("--region", region)) if value]
         if given:
             raise BadArgument(
-                f"{', '.join(given)}: expected one file, got {len(self.files)}. Leave it out, or submit them singly."
+                f"{', '.join(given)}: expected one file, got {len(self.files)}. Leave it out, or submit the files separately."
             )
         for file in self.files:
             existing_file(file, "tracks")
@@ -136,7 +136,7 @@ class Batch:
             made_folder(self.output / each, "--output")
 
     def run(self, client: Client) -> None:
-        """Submit all, and wait for them if that is wanted. What fails has a row of its own and stops nothing."""
+        """Submit all files and, if requested, wait for the jobs. A failure is recorded in its row and does not stop the others."""
         from pliant.client.progress import progress_bar
 
         with progress_bar(line_every=LINE_EVERY) as bar:
@@ -149,12 +149,12 @@ class Batch:
                 err().print(f"{row.file}: {row.job.status}", highlight=False, markup=False)
 
     def _submit(self, client: Client, bar: Bar) -> list[tuple[Row, RemoteJob]]:
-        """Submit each file and print the id of its job at once, so that an interruption loses none.
+        """Submit each file and print its job id immediately, so that an interruption loses none.
 
         Raises
         ------
         NotAuthorized
-            The token is missing or lacks a scope: every other file would be refused, too.
+            The token is missing or lacks a scope, so that every other file would be refused, too.
         """
         from pliant.client.errors import APIStatusError, NotAuthorized
 
@@ -184,7 +184,7 @@ class Batch:
         return submitted
 
     def _follow(self, row: Row, job: RemoteJob, bar: Bar) -> None:
-        """Wait for a job, and download its files if that is wanted."""
+        """Wait for a job, and download its files if there is an output folder."""
         from pliant.client.errors import PliantError
 
         try:
@@ -198,11 +198,11 @@ class Batch:
 
     @property
     def exit_code(self) -> Exit:
-        """How the command ends: well only if every file went well."""
+        """Exit code of the command: `DONE` only if every file succeeded."""
         return Exit.FAILED if any(row.error is not None for row in self.rows) else Exit.DONE
 
     def show(self, *, as_json: bool) -> None:
-        """Print the table."""
+        """Print the outcomes as a table or JSON."""
         if as_json:
             print_json([{"file": str(row.file), **self._outcome(row)} for row in self.rows])
             return
@@ -210,7 +210,7 @@ class Batch:
         from rich.text import Text
 
         longest = max((len(row.job.id) for row in self.rows if row.job is not None), default=0)
-        job_column = Column("job", no_wrap=True, min_width=longest)  # ids are for copying, also from narrow terminals
+        job_column = Column("job", no_wrap=True, min_width=longest)  # ids stay complete on narrow terminals
         table = Table("file", job_column, "status", "verdict", "seconds", "")
         for row in self.rows:
             job = row.job
@@ -228,12 +228,11 @@ class Batch:
         out().print(table)
 
     def _refusal(self, error: Exception) -> str:
-        """Return the message of an error, and where it is explained."""
+        """Return the message of an error with a reference to its explanation."""
         more = explained_at(details_of(error), self.url)
         return str(error) if more is None else f"{error} More about this error: {more}"
 
     def _outcome(self, row: Row) -> dict[str, Any]:
-        """Return what became of a file, as JSON."""
         return {
             "job": None if row.job is None else row.job.model_dump(mode="json"),
             "error": None if row.error is None else str(row.error),
@@ -241,7 +240,7 @@ class Batch:
         }
 
     def _common(self, secret: str | None) -> str:
-        """Return what the requests of all files have in common: mesh, truth and rotations by content, the secret by its digest."""
+        """Return the parameters that all files share as text; mesh, ground truth, rotations and secret by their digests."""
         from pliant.client.multipart import sha256
 
         parts = {name: None if part is None else str(part) for name, part in self.shared.items()}
@@ -253,7 +252,7 @@ class Batch:
         return json.dumps([self.key, self.options, self.priority, parts, digest], sort_keys=True)
 
     def _key_of(self, file: Path, common: str) -> str:
-        """Return the idempotency key of a file: of its content, its name, and all that goes with it."""
+        """Return the idempotency key of a file: a digest of its content, its name and the shared parameters."""
         from pliant.client.multipart import sha256
 
         content = sha256(file) if file.is_file() else str(file.absolute())

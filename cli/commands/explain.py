@@ -17,7 +17,7 @@ def explain(
     code: Annotated[str, typer.Argument(help="Code of an error; all codes if not given.", show_default=False)] = "",
     as_json: Json = False,
 ) -> None:
-    """Explain an error code: when the error occurs, and what to do. Every refusal names its code."""
+    """Explain an error code: when the error occurs, and what to do. Error messages state their code."""
     from pliant.schemas.problems import ProblemCode
 
     ctx.obj.json = as_json
@@ -36,7 +36,7 @@ def explain(
 
 
 def found_code(text: str) -> ProblemCode:
-    """Return the code of this text.
+    """Return the error code with this name.
 
     Raises
     ------

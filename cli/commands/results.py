@@ -25,7 +25,7 @@ def view(
     port: Annotated[int, typer.Option("--port", help="TCP port; 0 takes a free one.", min=0, max=65535)] = 0,
     as_json: Json = False,
 ) -> None:
-    """Show a result folder in the page's viewer, from this machine alone: no service, no queue. Ctrl-C ends it."""
+    """Show a result folder in the web viewer, without a service or a queue. Ctrl-C stops it."""
     ctx.obj.json = as_json
     require_server("pliant view")
     import uvicorn
@@ -59,12 +59,14 @@ def share(
     ctx: typer.Context,
     job: JobId,
     days: Annotated[float, typer.Option("--days", help="How long the link is valid.")] = 7,
-    revoke: Annotated[str | None, typer.Option("--revoke", help="End the link of this id.", metavar="LINK")] = None,
+    revoke: Annotated[
+        str | None, typer.Option("--revoke", help="Revoke the link with this id.", metavar="LINK")
+    ] = None,
     listed: Annotated[bool, typer.Option("--list", help="Print the valid links, without their secrets.")] = False,
     url: Url = HOME,
     as_json: Json = False,
 ) -> None:
-    """Print a read-only link to a finished job's result; whoever has it sees this result and nothing else."""
+    """Create and print a read-only link to a finished job's result. Anyone with the link sees this result and nothing else."""
     with ctx.obj.client(url, as_json=as_json) as client:
         found = find_job(client, job).id
         if revoke is not None:
@@ -98,7 +100,7 @@ def rerun(
     url: Url = HOME,
     as_json: Json = False,
 ) -> None:
-    """Submit a job's inputs again with other options, without sending them again, and print the new job."""
+    """Submit a job's stored inputs with other options, without uploading them again, and print the new job."""
     options = parse_options(option)
     with ctx.obj.client(url, as_json=as_json) as client:
         again = find_job(client, job).run_again(options, name=name)

@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 SHOWN = 20
-"""Jobs in the table."""
+"""Maximum number of jobs in the table."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What the service reports at one moment."""
+    """A snapshot of the service."""
 
     parts: dict[str, str]
-    """`ok` or a sentence for the job store, the blob store and the workers."""
+    """`ok` or the reason for a failure, for each of the job store, the blob store and the workers."""
     running: int
     queued: int
     jobs: tuple[Job, ...]
@@ -38,7 +38,7 @@ def top(
     url: Url = HOME,
     as_json: Json = False,
 ) -> None:
-    """Show running, queued and recent jobs, and whether every part of the service answers. Ctrl-C ends it."""
+    """Show running, queued and recent jobs, and the state of every component of the service. Ctrl-C stops it."""
     ctx.obj.json = as_json
     with ctx.obj.client(url, as_json=as_json) as client:
         if as_json:
@@ -57,7 +57,7 @@ def top(
 
 
 def looked(client: Client) -> View:
-    """Ask the service."""
+    """Query the service."""
     from itertools import islice
 
     from pliant.client.errors import ServiceFailed
@@ -76,7 +76,7 @@ def looked(client: Client) -> View:
 
 
 def drawn(view: View) -> Table:
-    """Return the table."""
+    """Return the snapshot as a table."""
     from rich.table import Table
     from rich.text import Text
 

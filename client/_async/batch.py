@@ -1,4 +1,4 @@
-"""Many inputs, one after the other: submitted a few ahead, returned in their order."""
+"""Many inputs: a limited number of jobs is submitted ahead, and results are returned in the order of the inputs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pliant.client._async.client import AsyncClient
 
 OnFailure = Callable[[int, PliantError], None]
-"""Called with the number of an input, from 0, and why it has no result."""
+"""Called with the index of an input that has no result, and the error."""
 
 
 async def mapped(
@@ -60,5 +60,5 @@ async def mapped(
 
 
 def named(source: object) -> str:
-    """Return the label of a job: its file's name without the ending as far as a service takes it, empty for arrays."""
+    """Return the label of a job: its file's name without extension, truncated to the service's limit; empty for arrays."""
     return job_name(Path(source).stem) if isinstance(source, (str, Path)) else ""

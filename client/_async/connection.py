@@ -1,4 +1,4 @@
-"""How a client reaches its service: address, token, TLS, retries."""
+"""The connection of a client to its service: address, token, TLS, retries."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DEFAULT_URL = "http://127.0.0.1:8000"
 
 
 class AsyncConnection:
-    """Base of `AsyncClient`, which states the parameters; close it, or use it in a ``with`` block."""
+    """Base class of `AsyncClient`, which documents the parameters. Close it, or use it in a ``with`` block."""
 
     def __init__(
         self,

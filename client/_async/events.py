@@ -1,4 +1,4 @@
-"""Following a job by server-sent events, resumed after the last event when the connection breaks."""
+"""Follow a job by server-sent events, and resume after the last event if the connection breaks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pliant.schemas.job import Job
 async def follow(exchange: Exchange, path: str) -> AsyncGenerator[Job, None]:
     """Yield the job each time its record changes; the last one has a final status.
 
-    A stream that breaks is reopened after the last event (`Last-Event-ID`), with the retries of any call.
+    A broken stream is reopened after the last event (`Last-Event-ID`), with the same retries as any call.
     """
     seen = Position()
     while True:
@@ -36,7 +36,7 @@ async def follow(exchange: Exchange, path: str) -> AsyncGenerator[Job, None]:
 
 
 async def _stream(exchange: Exchange, path: str, seen: Position) -> AsyncGenerator[Job, None]:
-    """Read one stream to its end, or to the job's."""
+    """Read one stream until it or the job ends."""
     headers = {"Accept": MEDIA_TYPE} if seen.last_id == "" else {"Accept": MEDIA_TYPE, "Last-Event-ID": seen.last_id}
     call = Call(method="GET", path=f"{path}/events", headers=headers)
     parser = Parser()

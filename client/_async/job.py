@@ -1,4 +1,4 @@
-"""What the client returns: a job of the service, and its result."""
+"""The objects that the client returns: a job of the service, and its result."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class AsyncRemoteJob:
         return await self._client.log(self.id, timeout=timeout)
 
     async def cancel(self, *, timeout: float | None = None) -> Self:
-        """Request that the job stops."""
+        """Request cancellation of the job."""
         self.record = (await self._client.cancel(self.id, timeout=timeout)).record
         return self
 
@@ -104,7 +104,7 @@ class AsyncRemoteJob:
         timeout: float | None = None,
         **options: Any,
     ) -> AsyncRemoteJob:
-        """Have further files written of the result, without solving again: see `AsyncClient.make_outputs`."""
+        """Queue and return a job that writes further files from the result: see `AsyncClient.make_outputs`."""
         return await self._client.make_outputs(
             self.id, outputs, fps=fps, idempotency_key=idempotency_key, timeout=timeout, **options
         )
@@ -112,7 +112,7 @@ class AsyncRemoteJob:
     async def run_again(
         self, options: Options | Mapping[str, Any] | None = None, *, name: str = "", timeout: float | None = None
     ) -> AsyncRemoteJob:
-        """Submit the same inputs with other options, without sending them again; without a name the new job has this one's."""
+        """Submit the same inputs with other options, without uploading them again; `name` defaults to this job's."""
         return await self._client.submit(inputs_of=self.id, options=options, name=name, timeout=timeout)
 
     async def share(self, *, days: float = 7, timeout: float | None = None) -> Share:

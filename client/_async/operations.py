@@ -1,4 +1,4 @@
-"""The operations of several requests: submit, wait, fetch."""
+"""The operations that take several requests: submit, wait, fetch."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ async def submit(
     """Submit inputs and return the new job. Temporary files are written to `folder`, which the caller removes."""
     texts = {
         "name": name, "webhook": webhook or "", "webhook_secret": webhook_secret or "",
-        "priority": "" if priority == "normal" else priority,  # a service that does not know it accepts the usual one
+        "priority": "" if priority == "normal" else priority,  # omitted for services without priorities
     }  # fmt: skip
     fields = option_fields(options) | {key: text for key, text in texts.items() if text != ""}
     whole = await in_thread(partial(inputs.form, folder, fields, on_upload))

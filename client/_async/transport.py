@@ -1,4 +1,4 @@
-"""Sending requests and reading answers, with retries."""
+"""Send requests and read responses, with retries."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Exchange:
     attempts: Attempts
 
     async def send(self, call: Call) -> httpx.Response:
-        """Send a call once and return the answer, whatever its status, with its body unread.
+        """Send a call once and return the response, whatever its status, with its body unread.
 
         Raises
         ------
@@ -42,7 +42,7 @@ class Exchange:
 
     @asynccontextmanager
     async def stream(self, call: Call) -> AsyncIterator[httpx.Response]:
-        """Send a call until an answer below 400 begins, and close that answer at the end.
+        """Send a call, with retries, until a response with a status below 400 begins; close that response at the end.
 
         Raises
         ------
@@ -57,7 +57,7 @@ class Exchange:
 
     @asynccontextmanager
     async def download(self, call: Call) -> AsyncIterator[httpx.Response]:
-        """As `stream`, for a file: follow a redirect to the object store, and fetch from the service if it leads nowhere."""
+        """Like `stream`, for a file: follow a redirect to the object store, and fall back to the service if that fails."""
         contact = self.attempts.contact
         if contact.follows:
             async with self.stream(replace(call, params={**call.params, "redirect": "true"})) as response:
@@ -77,7 +77,7 @@ class Exchange:
             yield response
 
     async def _from_store(self, location: str, call: Call) -> httpx.Response | None:
-        """Return the answer of the object store, None if it cannot be reached or refuses."""
+        """Return the object store's response, or None if the store cannot be reached or refuses the request."""
         try:
             response = await self.http.send(redirected(location, call, self.attempts.remaining()), stream=True)
         except (httpx.TransportError, httpx.InvalidURL):
@@ -88,7 +88,7 @@ class Exchange:
         return None
 
     async def answer(self, call: Call) -> tuple[httpx.Response, bytes]:
-        """Send a call and read the whole answer; an interrupted answer counts as a failure. Raises as `stream`."""
+        """Send a call and read the complete response; an interrupted response counts as a failure. Raises as `stream`."""
         while True:
             try:
                 async with self.stream(call) as response:
@@ -100,7 +100,7 @@ class Exchange:
             return response, body
 
     async def record(self, call: Call, kind: type[R]) -> R:
-        """Send a call and read its answer as a record of the wire contract. Raises as `stream`."""
+        """Send a call and parse the response as a record of the wire contract. Raises as `stream`."""
         response, body = await self.answer(call)
         return parse(kind, body, response.status_code)
 
@@ -131,7 +131,7 @@ class Exchange:
 
 
 async def refusal(response: httpx.Response) -> PliantError:
-    """Read an answer of 400 or more to its end and return the error that it stands for."""
+    """Read a response with status 400 or above completely and return the corresponding error."""
     try:
         body = await response.aread()
     finally:

@@ -1,5 +1,5 @@
 # Generated from client/_async/batch.py by `make client`. Edit that file instead.
-"""Many inputs, one after the other: submitted a few ahead, returned in their order."""
+"""Many inputs: a limited number of jobs is submitted ahead, and results are returned in the order of the inputs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pliant.client._sync.client import Client
 
 OnFailure = Callable[[int, PliantError], None]
-"""Called with the number of an input, from 0, and why it has no result."""
+"""Called with the index of an input that has no result, and the error."""
 
 
 def mapped(
@@ -61,5 +61,5 @@ def mapped(
 
 
 def named(source: object) -> str:
-    """Return the label of a job: its file's name without the ending as far as a service takes it, empty for arrays."""
+    """Return the label of a job: its file's name without extension, truncated to the service's limit; empty for arrays."""
     return job_name(Path(source).stem) if isinstance(source, (str, Path)) else ""

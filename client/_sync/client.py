@@ -90,8 +90,8 @@ class Client(Connection):
         film : path, optional
             A film instead of tracks: mp4, mov, webm, mkv, avi, animated GIF or a zip of pictures. The job tracks its points.
         region : path, optional
-            What to track in the film: a mask picture of its size, white inside. Without it and without the option
-            `region_polygon`, the whole picture.
+            Region to track in the film: a mask picture of the film's size, white inside. Without it and without the option
+            `region_polygon`, the entire picture is tracked.
         visible : array_like, optional
             Shape (F, P), bool or confidence in [0, 1]; only with an array of tracks.
         mesh : array_like, (rows, columns), path, optional
@@ -102,7 +102,7 @@ class Client(Connection):
         rotations : array_like or path, optional
             Known cameras (F, 2, 3) or (F, 3, 3).
         inputs_of : str, optional
-            Instead of files: the id of an earlier job, whose inputs are used again with these options.
+            Id of an earlier job whose inputs are reused with these options, instead of files.
         options : Options or mapping, optional
             Options of the reconstruction; validated before anything is sent.
         name : str
@@ -117,7 +117,7 @@ class Client(Connection):
         webhook_secret : str, optional
             Signs the webhook; create one with `pliant.client.webhooks.new_secret`.
         priority : str
-            ``"high"``, ``"normal"`` or ``"low"``: the order of your own waiting jobs; those of others are not passed.
+            ``"high"``, ``"normal"`` or ``"low"``. Orders only your own waiting jobs; jobs of other owners are not overtaken.
         on_upload : callable, optional
             Called with (bytes sent, total bytes).
         timeout : float, optional
@@ -168,14 +168,14 @@ class Client(Connection):
         inputs : iterable
             Each as the first parameter of `submit`.
         at_once : int
-            Jobs that are submitted ahead of the result that is waited for.
+            Maximum number of jobs that are submitted ahead.
         key : str, optional
-            Makes the whole call idempotent: repeated with the same key and inputs, it finds the jobs of the first time.
+            Makes the whole call idempotent: a call with the same key and inputs finds the jobs of the first call.
         on_failure : callable, optional
-            Called with the number of an input, from 0, and the error, where an input is refused or its job fails; the others go on.
-            Without it that error ends the iteration.
+            Called with the index of an input and the error, if the input is refused or its job fails; the iteration continues.
+            Without it the error is raised.
         load : bool
-            Download the arrays and the report of each.
+            Download the arrays and the report of each result.
         timeout : float, optional
             Seconds to wait for each result.
         **submission
@@ -205,7 +205,7 @@ class Client(Connection):
         on_upload: OnBytes | None = None,
         timeout: float | None = None,
     ) -> Interpretation:
-        """Have the service read and check inputs without creating a job.
+        """Let the service read and validate inputs without creating a job.
 
         Parameters
         ----------
@@ -215,12 +215,12 @@ class Client(Connection):
         Returns
         -------
         Interpretation
-            Frames, points, layout, hidden share, source of the mesh, and the evidence for each reading.
+            Frames, points, layout, hidden share, source of the mesh, and the evidence for each interpretation.
 
         Raises
         ------
         InvalidRequest
-            As for `submit`; `problem.choices` lists the possible readings of an ambiguous file.
+            As for `submit`; `problem.choices` lists the possible interpretations of an ambiguous file.
         """
         inputs = Inputs(tracks=tracks, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations)
         with tempfile.TemporaryDirectory(prefix="pliant-inspect-") as folder:
@@ -264,11 +264,11 @@ class Client(Connection):
         on_progress : callable, optional
             Called with the job each time its record changes.
         folder : path, optional
-            Where files of the result are kept; by default a temporary folder that is removed with the result.
+            Folder for the files of the result; by default a temporary folder that is removed with the result object.
         load : bool
             Download the arrays and the report.
         timeout : float, optional
-            Seconds for the whole call. After it `WaitTimeout` is raised and the job continues.
+            Seconds for the whole call, after which `WaitTimeout` is raised. The job continues.
 
         Raises
         ------
@@ -309,7 +309,7 @@ class Client(Connection):
         return body.decode("utf-8", "replace")
 
     def cancel(self, job: str, *, timeout: float | None = None) -> RemoteJob:
-        """Request that a job stops; a running one is `cancelling` until it has."""
+        """Request cancellation of a job; a running job has the status `cancelling` until it stops."""
         call = Call(method="POST", path=f"{job_path(job)}/cancel", changes_nothing=True)
         return RemoteJob(self, self._exchange(timeout).record(call, Job))
 
@@ -329,27 +329,27 @@ class Client(Connection):
         timeout: float | None = None,
         **options: Any,
     ) -> RemoteJob:
-        """Have further files written of a finished job's result, without solving again, and return the job that writes them.
+        """Queue and return a job that writes further files from a finished job's result, without solving again.
 
         Parameters
         ----------
         job : str
             The id of a job that has succeeded.
         outputs : iterable of str, or str
-            Any of ``glb``, ``ply``, ``obj``, ``usd``, ``abc``, ``mdd``, ``mat`` and ``csv``; a text is split at commas.
+            Any of ``glb``, ``ply``, ``obj``, ``usd``, ``abc``, ``mdd``, ``mat`` and ``csv``; a string is split at commas.
         fps : float, optional
             Frames per second of the written animation; by default the job's.
         idempotency_key : str, optional
             By default the same request returns the same job, unless that one failed or was cancelled.
         **options
-            ``normals``, ``colours``, ``axes``, ``glb_quantized`` and ``glb_motion``; those not given stay as the job has them.
+            ``normals``, ``colours``, ``axes``, ``glb_quantized`` and ``glb_motion``; by default the job's.
 
         Raises
         ------
         BadArgument
             An output or an option is unknown or invalid; nothing was sent.
         InvalidRequest, NotAllowedNow, NotFound
-            The service refuses; see `pliant.client.errors`.
+            The service refuses the request; see `pliant.client.errors`.
         """
         request = further(outputs, {**options, **({} if fps is None else {"fps": fps})})
         headers = JSON_BODY | ({} if idempotency_key is None else {"Idempotency-Key": idempotency_key})
@@ -358,14 +358,14 @@ class Client(Connection):
         return RemoteJob(self, self._exchange(timeout, "the request for further files").record(call, Job))
 
     def share(self, job: str, *, days: float = 7, timeout: float | None = None) -> Share:
-        """Create a link that shows a finished job's result, read-only, until it expires or is revoked.
+        """Create a read-only link to a finished job's result, valid until it expires or is revoked.
 
-        ``f"{client.url}/{share.path}"`` is the address to send; it holds the secret, which the service does not store.
+        ``f"{client.url}/{share.path}"`` is the address to send; it contains the secret, which the service does not store.
 
         Parameters
         ----------
         days : float
-            How long the link is valid, a minute to 366 days.
+            Lifetime of the link, from one minute to 366 days.
         """
         body = sharing(days).model_dump_json(exclude_unset=True).encode()
         call = Call(method="POST", path=f"{job_path(job)}/shares", headers=JSON_BODY, content=body)
@@ -377,7 +377,7 @@ class Client(Connection):
         return [Share.model_validate(each) for each in shares]
 
     def revoke_share(self, job: str, share: str, *, timeout: float | None = None) -> None:
-        """End a share link, named by its id."""
+        """Revoke a share link by its id."""
         call = Call(method="DELETE", path=f"{job_path(job)}/shares/{quote(share, safe='')}")
         self._exchange(timeout).answer(call)
 
@@ -387,7 +387,7 @@ class Client(Connection):
         try:
             exchange.answer(Call(method="DELETE", path=job_path(job)))
         except NotFound:
-            if exchange.attempts.failures == 0:  # otherwise an earlier attempt deleted it and its answer was lost
+            if exchange.attempts.failures == 0:  # otherwise an earlier attempt deleted it, and the response was lost
                 raise
 
     def download(
@@ -404,9 +404,9 @@ class Client(Connection):
         Parameters
         ----------
         names : iterable of str, optional
-            Which files; by default all.
+            Names of the files; by default all.
         on_download : callable, optional
-            Called with (bytes of this file so far, bytes of this file).
+            Called with (bytes of this file so far, total bytes of this file).
         """
         exchange = self._exchange(timeout, f"the download of job {job}")
         record = exchange.record(Call(method="GET", path=job_path(job)), Job)

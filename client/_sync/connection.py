@@ -1,5 +1,5 @@
 # Generated from client/_async/connection.py by `make client`. Edit that file instead.
-"""How a client reaches its service: address, token, TLS, retries."""
+"""The connection of a client to its service: address, token, TLS, retries."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DEFAULT_URL = "http://127.0.0.1:8000"
 
 
 class Connection:
-    """Base of `Client`, which states the parameters; close it, or use it in a ``with`` block."""
+    """Base class of `Client`, which documents the parameters. Close it, or use it in a ``with`` block."""
 
     def __init__(
         self,

@@ -19,13 +19,13 @@ from pliant.schemas.job import Artifact
 def download(exchange: Exchange, path: str, artifact: Artifact, folder: Path, *, on_download: OnBytes | None) -> Path:
     """Download an artifact into a folder, under its own name.
 
-    The bytes go to a partial file beside it, named after the SHA-256, which is renamed once it is complete and correct: a
-    file under the artifact's name is always whole. A partial file of an earlier call is continued.
+    The bytes go to a partial file in the same folder, whose name contains the SHA-256. It is renamed once it is complete and
+    correct, so a file with the artifact's name is always complete. A partial file of an earlier call is continued.
 
     Raises
     ------
     CorruptDownload
-        The bytes were wrong twice.
+        The SHA-256 was wrong after two downloads.
     """
     folder.mkdir(parents=True, exist_ok=True)
     whole = folder / Path(artifact.name).name
@@ -52,8 +52,8 @@ def download(exchange: Exchange, path: str, artifact: Artifact, folder: Path, *,
 def _fill(exchange: Exchange, path: str, artifact: Artifact, part: Path, *, on_download: OnBytes | None) -> None:
     """Append to the partial file until it is complete.
 
-    The service's entity tag is the SHA-256, so `If-Range` holds across restarts of both sides: a file that has changed is
-    sent from its beginning.
+    The service's entity tag is the SHA-256, so `If-Range` remains valid across restarts of client and service. A file that has
+    changed is sent from the beginning.
     """
     with part.open("ab") as file:
         while True:
@@ -81,7 +81,7 @@ def _fill(exchange: Exchange, path: str, artifact: Artifact, part: Path, *, on_d
 
 
 def _first_byte(response: httpx.Response) -> int:
-    """Offset of the answer's first byte in the file; -1 if Content-Range is malformed."""
+    """Return the offset of the response's first byte in the file, or -1 if Content-Range is malformed."""
     if response.status_code != 206:
         return 0
     match = re.match(r"bytes (\d+)-", response.headers.get("content-range", ""))

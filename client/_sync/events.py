@@ -1,5 +1,5 @@
 # Generated from client/_async/events.py by `make client`. Edit that file instead.
-"""Following a job by server-sent events, resumed after the last event when the connection breaks."""
+"""Follow a job by server-sent events, and resume after the last event if the connection breaks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pliant.schemas.job import Job
 def follow(exchange: Exchange, path: str) -> Generator[Job, None, None]:
     """Yield the job each time its record changes; the last one has a final status.
 
-    A stream that breaks is reopened after the last event (`Last-Event-ID`), with the retries of any call.
+    A broken stream is reopened after the last event (`Last-Event-ID`), with the same retries as any call.
     """
     seen = Position()
     while True:
@@ -37,7 +37,7 @@ def follow(exchange: Exchange, path: str) -> Generator[Job, None, None]:
 
 
 def _stream(exchange: Exchange, path: str, seen: Position) -> Generator[Job, None, None]:
-    """Read one stream to its end, or to the job's."""
+    """Read one stream until it or the job ends."""
     headers = {"Accept": MEDIA_TYPE} if seen.last_id == "" else {"Accept": MEDIA_TYPE, "Last-Event-ID": seen.last_id}
     call = Call(method="GET", path=f"{path}/events", headers=headers)
     parser = Parser()

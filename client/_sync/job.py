@@ -1,5 +1,5 @@
 # Generated from client/_async/job.py by `make client`. Edit that file instead.
-"""What the client returns: a job of the service, and its result."""
+"""The objects that the client returns: a job of the service, and its result."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class RemoteJob:
         return self._client.log(self.id, timeout=timeout)
 
     def cancel(self, *, timeout: float | None = None) -> Self:
-        """Request that the job stops."""
+        """Request cancellation of the job."""
         self.record = (self._client.cancel(self.id, timeout=timeout)).record
         return self
 
@@ -105,7 +105,7 @@ class RemoteJob:
         timeout: float | None = None,
         **options: Any,
     ) -> RemoteJob:
-        """Have further files written of the result, without solving again: see `Client.make_outputs`."""
+        """Queue and return a job that writes further files from the result: see `Client.make_outputs`."""
         return self._client.make_outputs(
             self.id, outputs, fps=fps, idempotency_key=idempotency_key, timeout=timeout, **options
         )
@@ -113,7 +113,7 @@ class RemoteJob:
     def run_again(
         self, options: Options | Mapping[str, Any] | None = None, *, name: str = "", timeout: float | None = None
     ) -> RemoteJob:
-        """Submit the same inputs with other options, without sending them again; without a name the new job has this one's."""
+        """Submit the same inputs with other options, without uploading them again; `name` defaults to this job's."""
         return self._client.submit(inputs_of=self.id, options=options, name=name, timeout=timeout)
 
     def share(self, *, days: float = 7, timeout: float | None = None) -> Share:

@@ -1,5 +1,5 @@
 # Generated from client/_async/operations.py by `make client`. Edit that file instead.
-"""The operations of several requests: submit, wait, fetch."""
+"""The operations that take several requests: submit, wait, fetch."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def submit(
     """Submit inputs and return the new job. Temporary files are written to `folder`, which the caller removes."""
     texts = {
         "name": name, "webhook": webhook or "", "webhook_secret": webhook_secret or "",
-        "priority": "" if priority == "normal" else priority,  # a service that does not know it accepts the usual one
+        "priority": "" if priority == "normal" else priority,  # omitted for services without priorities
     }  # fmt: skip
     fields = option_fields(options) | {key: text for key, text in texts.items() if text != ""}
     whole = in_place(partial(inputs.form, folder, fields, on_upload))

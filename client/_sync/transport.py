@@ -1,5 +1,5 @@
 # Generated from client/_async/transport.py by `make client`. Edit that file instead.
-"""Sending requests and reading answers, with retries."""
+"""Send requests and read responses, with retries."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Exchange:
     attempts: Attempts
 
     def send(self, call: Call) -> httpx.Response:
-        """Send a call once and return the answer, whatever its status, with its body unread.
+        """Send a call once and return the response, whatever its status, with its body unread.
 
         Raises
         ------
@@ -43,7 +43,7 @@ class Exchange:
 
     @contextmanager
     def stream(self, call: Call) -> Iterator[httpx.Response]:
-        """Send a call until an answer below 400 begins, and close that answer at the end.
+        """Send a call, with retries, until a response with a status below 400 begins; close that response at the end.
 
         Raises
         ------
@@ -58,7 +58,7 @@ class Exchange:
 
     @contextmanager
     def download(self, call: Call) -> Iterator[httpx.Response]:
-        """As `stream`, for a file: follow a redirect to the object store, and fetch from the service if it leads nowhere."""
+        """Like `stream`, for a file: follow a redirect to the object store, and fall back to the service if that fails."""
         contact = self.attempts.contact
         if contact.follows:
             with self.stream(replace(call, params={**call.params, "redirect": "true"})) as response:
@@ -78,7 +78,7 @@ class Exchange:
             yield response
 
     def _from_store(self, location: str, call: Call) -> httpx.Response | None:
-        """Return the answer of the object store, None if it cannot be reached or refuses."""
+        """Return the object store's response, or None if the store cannot be reached or refuses the request."""
         try:
             response = self.http.send(redirected(location, call, self.attempts.remaining()), stream=True)
         except (httpx.TransportError, httpx.InvalidURL):
@@ -89,7 +89,7 @@ class Exchange:
         return None
 
     def answer(self, call: Call) -> tuple[httpx.Response, bytes]:
-        """Send a call and read the whole answer; an interrupted answer counts as a failure. Raises as `stream`."""
+        """Send a call and read the complete response; an interrupted response counts as a failure. Raises as `stream`."""
         while True:
             try:
                 with self.stream(call) as response:
@@ -101,7 +101,7 @@ class Exchange:
             return response, body
 
     def record(self, call: Call, kind: type[R]) -> R:
-        """Send a call and read its answer as a record of the wire contract. Raises as `stream`."""
+        """Send a call and parse the response as a record of the wire contract. Raises as `stream`."""
         response, body = self.answer(call)
         return parse(kind, body, response.status_code)
 
@@ -132,7 +132,7 @@ class Exchange:
 
 
 def refusal(response: httpx.Response) -> PliantError:
-    """Read an answer of 400 or more to its end and return the error that it stands for."""
+    """Read a response with status 400 or above completely and return the corresponding error."""
     try:
         body = response.read()
     finally:

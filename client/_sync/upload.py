@@ -25,8 +25,8 @@ from pliant.schemas.job import Upload
 def upload_large(exchange: Exchange, form: Form, key: str) -> Form:
     """Upload the large files of a form and return the form that refers to them.
 
-    It is returned unchanged if its files are small, or if the service has no uploads. The same `key` of a submission and the same
-    content find the bytes of an earlier run.
+    The form is returned unchanged if its files are small or the service does not support uploads. With the same `key` and
+    content, the bytes that an earlier run uploaded are reused.
     """
     if form.size <= multipart.RESUMABLE_BYTES:
         return form
@@ -51,9 +51,9 @@ def upload_large(exchange: Exchange, form: Form, key: str) -> Form:
 
 
 def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str, report: Callable[[int], None]) -> bool:
-    """Send a file from its last stored byte on; return False if the service has no uploads.
+    """Upload a file, starting after the last stored byte; return False if the service does not support uploads.
 
-    Each stored byte counts as success: a poor connection is not given up while it makes progress.
+    Each stored byte counts as success, so the client does not give up on a poor connection that makes progress.
     """
     attempts, size, reached = exchange.attempts, path.stat().st_size, 0
     encoded = base64.b64encode(bytes.fromhex(digest)).decode()
@@ -88,7 +88,7 @@ def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str, repor
 
 
 def delete_uploads(exchange: Exchange, form: Form) -> None:
-    """Delete the uploads of a form, once the service has answered; those that remain, as after the deadline, expire."""
+    """Delete the uploads of a form that was submitted; uploads that remain, for example after the deadline, expire."""
     for name, upload_id in form.fields.items():
         if name.endswith("_upload"):
             with suppress(httpx.TransportError, PliantError):
@@ -97,7 +97,7 @@ def delete_uploads(exchange: Exchange, form: Form) -> None:
 
 
 def _state(exchange: Exchange, upload_id: str) -> Upload | None:
-    """Return the state of an upload, None if the service has no uploads. Does not count as success."""
+    """Return the state of an upload, or None if the service does not support uploads. Does not count as success."""
     call = Call(method="GET", path=_path(upload_id))
     while True:
         try:

@@ -28,7 +28,7 @@ _log = logging.getLogger("pliant.access")
 class AccessLog:
     """ASGI middleware, the outermost: gives each request an id, returns it as `X-Request-ID`, and logs the outcome.
 
-    A client's or proxy's own `X-Request-ID` is taken over if it is at most 128 letters, digits or ``._:+=/-``.
+    The `X-Request-ID` of a client or proxy is kept if it consists of at most 128 letters, digits or ``._:+=/-``.
     """
 
     def __init__(self, app: ASGIApp, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -69,7 +69,7 @@ class AccessLog:
 
 
 def _write(scope: Scope, kept: dict[str, str], *, status: int, seconds: float) -> None:
-    """Log one request: errors of the service at level error, refusals at warning. Status 0: the client left first."""
+    """Log one request: errors of the service at level error, refusals at warning. Status 0: the client disconnected first."""
     # The path as it was sent, percent-encoded, so that it cannot hold a line break.
     path = bytes(scope.get("raw_path") or scope["path"].encode()).decode("ascii", "backslashreplace")[:200]
     level = logging.ERROR if status >= 500 else logging.WARNING if status >= 400 else logging.INFO

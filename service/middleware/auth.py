@@ -33,7 +33,7 @@ _READS = frozenset({"GET", "HEAD", "OPTIONS"})
 def needed(method: str, path: str) -> Scope | None:
     """Return the scope that a request needs; None if any valid token will do.
 
-    The state of an upload belongs to sending it: a token that may only submit reads where to resume.
+    Reading the state of an upload needs `submit`, so that a token with only this scope can resume an upload.
     """
     if path == "/metrics":
         return Scope.ADMIN
@@ -50,7 +50,7 @@ def is_public(path: str) -> bool:
 
 
 class StillValid:
-    """Checks again whether a request's token is valid; for answers that last."""
+    """Checks again whether a request's token is valid, for long-lived responses."""
 
     def __init__(self, tokens: Tokens, token: Token, *, every: float) -> None:
         self._tokens = tokens
@@ -59,7 +59,7 @@ class StillValid:
         self._checked = time.monotonic()
 
     async def __call__(self) -> bool:
-        """Check, at most once per period; while the store does not answer the token counts as valid."""
+        """Return True if the token is valid, checked at most once per period; it counts as valid if the store does not answer."""
         now = time.monotonic()
         if now < self._checked + self._every:
             return True
@@ -76,8 +76,8 @@ class StillValid:
 class Authentication:
     """ASGI middleware that requires a valid token and sets `pliant.token` and `pliant.owner` in the request's scope.
 
-    The owner is None where all jobs are visible: with tokens off, and with the scope `admin`. The token of a share link is checked
-    even where tokens are off.
+    The owner is None if all jobs are visible: with tokens off, and with the scope `admin`. The token of a share link is checked
+    even with tokens off.
     """
 
     def __init__(self, app: ASGIApp, settings: ServiceSettings, tokens: Tokens, records: Records) -> None:
@@ -88,7 +88,7 @@ class Authentication:
         self._recheck = settings.heartbeat_seconds
 
     async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
-        """Pass on an authorized request, refuse the others."""
+        """Pass on authorized requests and refuse others."""
         if scope["type"] != "http" or is_public(scope["path"]):
             await self._app(scope, receive, send)
             return
@@ -142,7 +142,7 @@ class Authentication:
 
 
 def _unauthorized(code: ProblemCode, detail: str) -> Response:
-    """Return the answer 401; the challenge distinguishes a missing token from an invalid one (RFC 6750, section 3)."""
+    """Return the 401 response; its challenge distinguishes a missing token from an invalid one (RFC 6750, section 3)."""
     challenge = 'Bearer realm="pliant"'
     if code is not ProblemCode.UNAUTHORIZED:
         challenge += ', error="invalid_token"'

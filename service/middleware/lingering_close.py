@@ -1,8 +1,8 @@
-"""Refusing a request whose body is still on its way, so that the client gets to read why.
+"""Lingering close: refuse a request whose body is still arriving, so that the client can read the response.
 
-Answering and closing at once makes the kernel reset the connection while the client still sends, and the reset throws away
-the answer on the client's side. So the answer goes out with `Connection: close`, then what the client is still sending is
-read and dropped for a bounded time, and only then is the connection closed.
+If the connection is closed immediately, the kernel resets it while the client is still sending, and the reset discards the
+response on the client's side. Therefore the response is sent with `Connection: close`, the rest of the body is read and
+discarded for a bounded time, and only then is the connection closed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ LINGER_BYTES = 16 * 2**20
 
 
 class LingeringClose:
-    """ASGI middleware: if the application answers before it has read the whole body, drain some of it, then close."""
+    """ASGI middleware: if the application responds before it has read the whole body, drain part of it, then close."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -50,13 +50,12 @@ class LingeringClose:
 
 
 def _has_body(scope: Scope) -> bool:
-    """Return True if the request's headers announce a body."""
     headers = dict(scope["headers"])
     return b"transfer-encoding" in headers or headers.get(b"content-length", b"0") != b"0"
 
 
 async def _drain(receive: Receive) -> None:
-    """Read and drop the body until it ends, or the time or the bytes for that are used up."""
+    """Read and discard the body until it ends or a limit on time or bytes is reached."""
     dropped = 0
     try:
         async with asyncio.timeout(LINGER_SECONDS):

@@ -1,6 +1,6 @@
-"""The origin check: refuses unknown Host headers, and writes that a browser sends for a page of another site.
+"""The origin check refuses unknown Host headers, and writes that a browser sends for a page of another site.
 
-It reads the headers alone, before a byte of the body is read.
+It uses only the headers, before a byte of the body is read.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
 class OriginCheck:
-    """ASGI middleware against pages of other sites.
+    """ASGI middleware against requests from pages of other sites.
 
-    A service on the loopback address without tokens is reachable by every page the user visits: through a name that
-    resolves to 127.0.0.1 (DNS rebinding), and by forms, which browsers send across sites without asking.
+    A service on the loopback address without tokens is reachable from every page the user visits: through a name that
+    resolves to 127.0.0.1 (DNS rebinding), and through forms, which browsers send across sites without a preflight.
     """
 
     def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
@@ -56,7 +56,7 @@ class OriginCheck:
 
 
 def _without_port(host: str) -> str:
-    """Return a Host header's name, in lower case, an IPv6 address with its brackets."""
+    """Return the host of a Host header in lower case, IPv6 addresses with their brackets."""
     if host.startswith("["):
         return host.partition("]")[0].lower() + "]"
     return host.partition(":")[0].lower()

@@ -1,7 +1,7 @@
 """Rate limits per token, or per address where tokens are off, counted in this process.
 
-The counts are in memory: the store writes every change to disk before it answers, which would cost more than most requests.
-N API processes therefore allow N times as many requests.
+The counts are in memory, because the store writes every change to disk before it answers, which would cost more than most
+requests. N API processes therefore allow N times as many requests.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from pliant.worker.tokens import Token
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 WINDOW = 60.0
-"""Seconds whose requests may all come at once."""
+"""Burst size: the requests allowed within this many seconds may all arrive at once."""
 
 MOST_CLIENTS = 20_000
-"""Clients remembered; beyond that, those with the most requests left are forgotten first."""
+"""Maximum number of clients in memory; above it, those with the most requests left are dropped first."""
 
 UNCOUNTED = frozenset({"/healthz", "/readyz"})
 
 
 class Rates:
-    """The generic cell rate algorithm (ITU-T I.371): one time stamp per client, when its requests so far are paid off."""
+    """The generic cell rate algorithm (ITU-T I.371), with one theoretical arrival time per client."""
 
     def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._paid_off: dict[str, float] = {}
 
     def take(self, who: str, per_minute: int) -> float:
-        """Count a client's request; return 0 if it is allowed, else the seconds to wait (it is not counted then)."""
+        """Count a client's request and return 0 if it is allowed; otherwise return the seconds to wait without counting it."""
         now, price = self._clock(), WINDOW / per_minute
         due = max(self._paid_off.get(who, now), now) + price
         if due - now > WINDOW * (1 + 1e-9):
@@ -52,7 +52,7 @@ class Rates:
 
 
 class RateLimit:
-    """ASGI middleware that answers 429 above the limit. It runs after `Authentication`, which identifies the client."""
+    """ASGI middleware that responds with 429 above the limit. It runs after `Authentication`, which identifies the client."""
 
     def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
         self._app = app

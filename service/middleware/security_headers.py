@@ -1,4 +1,4 @@
-"""Headers of every answer that restrict what a browser does with it."""
+"""Headers of every response that restrict what a browser does with it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 SECURITY_HEADERS = {
-    # An answer of the API is no page and loads nothing; the page sets its own policy (`pliant.service.page`).
+    # API responses load nothing; the page sets its own policy (`pliant.service.page`).
     "Content-Security-Policy": "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
@@ -18,13 +18,13 @@ SECURITY_HEADERS = {
 
 
 class SecurityHeaders:
-    """ASGI middleware that adds `SECURITY_HEADERS` and `Cache-Control: no-store`; a header that a route has set stays."""
+    """ASGI middleware that adds `SECURITY_HEADERS` and `Cache-Control: no-store`; headers that a route sets take precedence."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on and add the headers to its answer."""
+        """Pass the request on and add the headers to its response."""
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":

@@ -1,4 +1,4 @@
-"""Requests that come through a share link: they read one job and its files, and nothing else."""
+"""Requests through share links, which can read one job and its files, and nothing else."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ _READABLE = re.compile(r"/v1/jobs/(?P<id>[^/]+)(/events|/shares|/artifacts(/[^/]
 
 
 def bearer_of(scope: Scope) -> str | None:
-    """Return the bearer token of a request; None if it carries none, or several."""
+    """Return the bearer token of a request; None if it has none, or several."""
     given = Headers(scope=scope).getlist("authorization")
     scheme, _, text = given[0].partition(" ") if len(given) == 1 else ("", "", "")
     return text.strip() if scheme.lower() == "bearer" else None
 
 
 def share_of(scope: Scope) -> str | None:
-    """Return the token of a request's share link, None if the request carries no such token."""
+    """Return the share link's token of a request, or None if it has none."""
     token = bearer_of(scope)
     return token if token is not None and token.startswith(SHARE_PREFIX) else None
 
 
 async def authorize_share(scope: Scope, token: str, records: Records) -> Response | None:
-    """Let a request pass that its link allows, with the job's owner and the link's id in the scope; else return the refusal."""
+    """Return the refusal of a request that its link does not allow; else set `pliant.owner` and `pliant.share` in the scope."""
     now = utc_now()
     try:
         found = await to_thread.run_sync(recognise_share, records, token)

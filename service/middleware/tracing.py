@@ -1,4 +1,4 @@
-"""A span for each request, which continues the trace that the request names."""
+"""A span for each request, which continues the trace of the request's `traceparent` header."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 UNTRACED = frozenset({"/healthz", "/readyz", "/metrics"})
-"""Paths that are called every few seconds."""
+"""Paths that monitoring requests every few seconds."""
 
 
 class Tracing:
-    """ASGI middleware. Where tracing is off it only passes requests on."""
+    """ASGI middleware that records a span per request; with tracing off it only passes requests on."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

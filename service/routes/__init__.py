@@ -1,1 +1,1 @@
-"""The addresses of the service, by subject."""
+"""The routes of the service, by subject."""

@@ -1,4 +1,4 @@
-"""Result files: the list, and each by name, whole or a range of bytes."""
+"""Result files: list them, and download each by name, completely or in byte ranges."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ Redirect = Annotated[
     bool, Query(description="The client follows a redirect to the object store, without its `Authorization` header.")
 ]
 LINK_SECONDS = 300.0
-"""Seconds within which a redirect to the object store has to be followed; the transfer itself may take longer."""
+"""Seconds for which a redirect to the object store can be followed; the transfer itself may take longer."""
 
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
-# Generators of clients take the first; the file's own media type is in its description.
+# Client generators use the first; the list of files has the media type of each.
 _BYTES = {"application/octet-stream": _BINARY, "*/*": _BINARY}
 
 
@@ -56,8 +56,8 @@ def artifacts(id: Id, jobs: Mine) -> list[Artifact]:
 def artifact(id: Id, name: Name, request: Request, jobs: Mine, core: Core, redirect: Redirect = False) -> Response:
     """Return a file. `Range` with `If-Range` resumes a download; `ETag` and `Repr-Digest` are its SHA-256.
 
-    With `redirect=true` a service that keeps its files in S3 may answer 307 with a signed URL: send `Range` there too, but neither
-    `If-Range` nor `Authorization`. Elsewhere the parameter has no effect.
+    With `redirect=true` a service that stores files in S3 may return 307 with a presigned URL: send `Range` to it, too, but neither
+    `If-Range` nor `Authorization`. Otherwise the parameter has no effect.
     """
     about, blob = _open(jobs, id, name)
     size = blob.size
@@ -66,7 +66,7 @@ def artifact(id: Id, name: Name, request: Request, jobs: Mine, core: Core, redir
     headers = {
         "ETag": etag,
         "Accept-Ranges": "bytes",
-        "Cache-Control": "private, no-cache",  # kept, but revalidated each time: the token may have been revoked
+        "Cache-Control": "private, no-cache",  # cached, but revalidated each time: the token may have been revoked
     }
     if part.status == 412:
         detail = "The file is not the one that If-Match names. Download it again, without that header."
@@ -100,16 +100,16 @@ def artifact(id: Id, name: Name, request: Request, jobs: Mine, core: Core, redir
 
 
 def _link(blob: Blob, part: Slice, request: Request) -> str | None:
-    """Return the file's URL in the object store, None if this answer cannot be given from there.
+    """Return the file's URL in the object store, or None if the service must respond itself.
 
-    The store does not know the file's SHA-256, so a `Range` that is ignored, for example because of `If-Range`, is answered here.
+    The store does not know the file's SHA-256, so it cannot ignore a `Range` because of `If-Range`, as the service does.
     """
     ignored = "range" in request.headers and part.status != 206
     return None if request.method == "HEAD" or ignored else blob.link(seconds=LINK_SECONDS)
 
 
 def _open(jobs: Jobs, id: str, name: str) -> tuple[Artifact, Blob]:
-    """Return a file's description and its bytes; a file that is deleted meanwhile is gone, not a defect."""
+    """Return a file's description and its bytes; raise `Refusal` (410) if the file was deleted meanwhile."""
     try:
         return jobs.artifact(id, name)
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""What error codes mean: the address in `Problem.type`."""
+"""Explanations of error codes, at the address in `Problem.type`."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def explain(code: ProblemCode) -> ErrorCode:
 
 
 def page_of(error: ErrorCode) -> str:
-    """Return the HTML page of a code: no styles and no scripts, as the content security policy of the API demands."""
+    """Return the HTML page of a code, without styles and scripts, as the content security policy of the API requires."""
     status = "" if error.status is None else f"<p>HTTP status {error.status}</p>"
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'

@@ -61,13 +61,13 @@ async def events(
     jobs: Mine,
     last: Annotated[str | None, Header(alias="Last-Event-ID", description="The last event received.")] = None,
 ) -> Response:
-    """Stream `job` events (the whole job, when its status changed) and `progress` events, and end when the job has.
+    """Stream `job` events (the complete job, whenever its status changes) and `progress` events until the job ends.
 
-    Begins with the events that are kept, or after `Last-Event-ID`; a browser's EventSource sends that by itself.
+    The stream starts with the stored events, or after `Last-Event-ID`, which a browser's EventSource sends automatically.
     A comment line every 15 s keeps proxies from closing the connection. The stream also ends when the token expires or is revoked.
     """
     stream = core.followers.follow(jobs, id, after=last or None, heartbeat=core.settings.heartbeat_seconds)
-    # Refuse before the stream begins: afterwards there is no status code to report an error with.
+    # Refuse before the stream begins, while a status code can still report an error.
     await to_thread.run_sync(partial(jobs.events, id, after=last or None))
     return EventSourceResponse(
         _encode(stream, still_valid=request.scope.get("pliant.still_valid")),
@@ -108,5 +108,5 @@ async def _encode(
                 else:
                     yield _encoded(event)
     except WorkerError as error:
-        # The store does not answer or the job was deleted: the client reconnects with Last-Event-ID and gets a status.
+        # The store does not answer or the job was deleted: the client reconnects with Last-Event-ID and gets an error status.
         _log.warning("an event stream ended early: %s", error)

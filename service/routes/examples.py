@@ -21,7 +21,7 @@ class ExampleFile(Record):
     """One input file of an example."""
 
     part: str
-    """The form part to send it as."""
+    """Name of the form part for this file."""
     file: str
     url: str
 
@@ -33,7 +33,7 @@ class Example(Record):
     title: str
     files: list[ExampleFile]
     region_polygon: list[tuple[float, float]] | None = None
-    """The object in a film's first frame, for the option of this name."""
+    """Outline of the object in a film's first frame, for the option of the same name."""
 
 
 class Examples(Record):
@@ -64,7 +64,7 @@ def examples(request: Request) -> Examples:
 
 
 def _films(request: Request) -> list[Example]:
-    """Return the example film, if films are tracked here."""
+    """Return the example film, if this installation can track films."""
     if not example_film.available():
         return []
     name, file = example_film.NAME, example_film.FILE

@@ -20,9 +20,9 @@ from pliant.worker.uploads.service import Uploads
 router = APIRouter(prefix="/v1/inspect", tags=["jobs"])
 
 SAMPLE_FRAMES, SAMPLE_POINTS = 16, 200
-"""Largest sample."""
+"""Maximum numbers of frames and points in a sample."""
 BOX = 1000
-"""Side of the square that holds the sample."""
+"""Side of the square to which a sample's coordinates are scaled."""
 NOT_SEEN = -1
 
 
@@ -36,7 +36,7 @@ NOT_SEEN = -1
 async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUploads) -> Inspection:
     """Read the parts of a job as `POST /v1/jobs` would, and return the interpretation without creating a job.
 
-    Inputs that a submission refuses are refused with the same problem, `choices` included. Nothing is kept.
+    Inputs that a submission would refuse are refused with the same problem, including `choices`. Nothing is stored.
     """
     rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
     with core.incoming.scratch() as folder:
@@ -57,10 +57,10 @@ def interpret(form: Form, folder: Path, uploads: Uploads, core: Service) -> Insp
 
 
 def sample_of(inputs: Inputs) -> list[list[int]]:
-    """Return evenly spaced frames and points as integers in a square, small enough to be sent along for a picture.
+    """Return evenly spaced frames and points as integer coordinates in a square, as a small sample for a picture.
 
-    One list per frame: x and y of each point in turn, 0 … `BOX`, x right, y down, to one scale; `NOT_SEEN` twice for a hidden
-    point.
+    One list per frame: x and y of each point in turn, 0 … `BOX`, x right, y down, with one scale for both axes; `NOT_SEEN` twice
+    for a point that is hidden or outside the square.
     """
     points, visible = inputs.tracks.points, inputs.tracks.visible
     frames, chosen = evenly(len(points), SAMPLE_FRAMES), evenly(points.shape[1], SAMPLE_POINTS)
@@ -68,7 +68,7 @@ def sample_of(inputs: Inputs) -> list[list[int]]:
     seen = visible[np.ix_(frames, chosen)] > 0
     if not seen.any():
         return [[NOT_SEEN] * (2 * len(chosen))] * len(frames)
-    # The square holds the positions between the outer percentiles, so that a gross outlier does not shrink the rest to a dot.
+    # The 1st and 99th percentiles determine the scale, so that a gross outlier does not shrink the rest to a dot.
     low, high = np.percentile(some[seen], (1, 99), axis=0)
     scale = 0.9 * BOX / max(float((high - low).max()), np.finfo(float).tiny)
     placed = BOX / 2 + scale * (some - (low + high) / 2)
@@ -77,5 +77,5 @@ def sample_of(inputs: Inputs) -> list[list[int]]:
 
 
 def evenly(count: int, most: int) -> NDArray[np.intp]:
-    """Return at most that many indices, evenly spread over 0 … count − 1, both ends among them."""
+    """Return at most `most` indices, evenly spread over 0 … count − 1 and including both ends."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.intp))

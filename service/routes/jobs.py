@@ -33,7 +33,7 @@ _KeyHeader = Annotated[
 
 
 def idempotency_key(request: Request, key: _KeyHeader = None) -> str | None:
-    """Return the one `Idempotency-Key`; two of them could each mean another job."""
+    """Return the `Idempotency-Key`; several are refused, because each could stand for another job."""
     if len(request.headers.getlist("idempotency-key")) > 1:
         detail = "The header Idempotency-Key was sent more than once. Send one key."
         raise Refusal(ProblemCode.CONFLICTING_HEADERS, detail=detail, field="Idempotency-Key")
@@ -63,7 +63,7 @@ async def submit(
     """Read and validate the inputs, and queue the job.
 
     After 202 the job is stored durably: it ends with a result or an error even if processes are killed meanwhile.
-    After any other status nothing was queued and nothing is kept.
+    After any other status nothing is queued or stored.
     """
     job, _ = await _receive(request, core, jobs, bounds, idempotency_key=key)
     return await _accepted(job, core, jobs, prefer, response)
@@ -111,7 +111,7 @@ def page(
     responses={200: {"content": JOB_EXAMPLE}, **problems(401, 404, 422, 503)},
 )
 async def get(id: Id, response: Response, core: Core, jobs: Mine, prefer: Prefer = None) -> Job:
-    """Return a job: status, progress, place in the queue, metrics, files, or why it failed."""
+    """Return a job: status, progress, position in the queue, metrics and files, or the reason for its failure."""
     job = await to_thread.run_sync(jobs.get, id)
     return await _waited(job, core, jobs, prefer, response)
 
@@ -120,7 +120,7 @@ async def get(id: Id, response: Response, core: Core, jobs: Mine, prefer: Prefer
     "/{id}/cancel", operation_id="cancel_job", summary="Cancel a job", responses=problems(401, 403, 404, 409, 503)
 )
 def cancel(id: Id, jobs: Mine) -> Job:
-    """Cancel a job. A queued job ends at once, a running one at its next iteration."""
+    """Cancel a job. A queued job ends immediately, a running one at its next iteration."""
     return jobs.cancel(id)
 
 
@@ -159,7 +159,7 @@ async def _receive(
     id: str | None = None,
     idempotency_key: str | None = None,
 ) -> tuple[Job, bool]:
-    """Receive a form into a scratch directory and submit the job; the directory is removed in any case."""
+    """Receive a form into a scratch directory and submit the job; the directory is always removed."""
     rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
     await to_thread.run_sync(lambda: jobs.check_capacity(id=id, idempotency_key=idempotency_key))
     with core.incoming.scratch() as folder:
@@ -179,9 +179,9 @@ async def _receive(
 
 
 async def _accepted(job: Job, core: Service, jobs: Jobs, prefer: str | None, response: Response) -> Job:
-    """Return a submitted job, after the wait that was asked for.
+    """Return a submitted job, after the wait that `Prefer` requests.
 
-    Where the wait fails, it is returned as it was accepted: the job is stored, and an error would say that it is not.
+    If the wait fails, return the job as it was accepted: it is stored, and an error would suggest that it is not.
     """
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     try:

@@ -15,12 +15,12 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 async def read_json(request: Request, model: type[Model]) -> Model:
-    """Return the body of a request; an empty one stands for a JSON object without members.
+    """Return the parsed body of a request; an empty body counts as an empty JSON object.
 
     Raises
     ------
     Refusal
-        413 too large, 408 stalled, 415 another media type, 422 not JSON or not the model's.
+        413: too large; 408: stalled; 415: another media type; 422: not JSON, or invalid for the model.
     """
     settings = service_of(request).settings
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()

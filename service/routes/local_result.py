@@ -1,4 +1,4 @@
-"""The page's viewer on a result folder of this machine: read-only, without queue, store or worker."""
+"""The web viewer for a local result folder: read-only, without queue, store or worker."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def read_result(folder: Path) -> Job:
     Raises
     ------
     InvalidRequest
-        Code not_a_result: it has no `report.json` and `preview.bin`, or the report is not one of ours.
+        Code not_a_result: `report.json` or `preview.bin` is missing, or the report was not written by Pliant.
     """
     missing = [name for name in (REPORT, PREVIEW) if not (folder / name).is_file()]
     if missing:
@@ -62,7 +62,7 @@ def read_result(folder: Path) -> Job:
 def create_viewer(folder: Path, token: str) -> FastAPI:
     """Return an application that shows the result in a folder at ``/{token}/#view=local``; every other path is unknown.
 
-    Only the loopback names are answered as Host, so that no other site reaches the files through its own name.
+    Only loopback names are accepted as Host, so that no other site can reach the files through its own name.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def _artifact(path: Path, stated: dict[str, Any]) -> Artifact:
 
 
 def _shown(path: Path, stated: dict[str, Any]) -> bool:
-    """Show the files of the result; others that lie in the folder are nobody's business."""
+    """Return True for files of the result; other files in the folder are not served."""
     return path.is_file() and not path.is_symlink() and (path.name in stated or path.name == REPORT)
 
 

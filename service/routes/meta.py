@@ -30,7 +30,7 @@ def options() -> dict[str, Any]:
 
 @router.get("/v1/limits", operation_id="get_limits", summary="What this service accepts", responses=problems(401))
 def limits(core: Core, bounds: Bound) -> ServiceLimits:
-    """Return the limits on bodies, frames, points, queued jobs and requests that hold for the request's token."""
+    """Return the limits on bodies, frames, points, queued jobs and requests that apply to the request's token."""
     taken = {field.name for field in dataclasses.fields(core.limits)} & set(ServiceLimits.model_fields)
     return ServiceLimits(
         **{name: getattr(core.limits, name) for name in taken},
@@ -43,7 +43,7 @@ def limits(core: Core, bounds: Bound) -> ServiceLimits:
 
 @router.get("/healthz", operation_id="get_health", summary="Liveness: the process answers")
 async def healthz() -> dict[str, str]:
-    """Return 200 while the process answers; it checks nothing else and waits for no thread."""
+    """Return 200 while the process responds. It checks nothing else and does not wait for a thread."""
     return {"status": "ok"}
 
 
@@ -53,10 +53,10 @@ async def healthz() -> dict[str, str]:
 def readyz(
     core: Core, exclude: Annotated[list[Part] | None, Query(description="Parts to leave out; can be repeated.")] = None
 ) -> dict[str, str]:
-    """Return 200 if the job store, the blob store and at least one worker answer, else 503 with the missing parts.
+    """Return 200 if the job store, the blob store and at least one worker respond, else 503 with the parts that do not.
 
-    Probes of the API process alone use `?exclude=workers`: without a worker it still accepts jobs and serves results.
-    Where tokens are required, the answer names the missing parts only; the reasons are in the service's log.
+    To probe only the API process, use `?exclude=workers`: without a worker it still accepts jobs and serves results.
+    If tokens are required, the response contains no reasons; they are in the service's log.
     """
     parts = {name: state for name, state in core.jobs.ready().items() if name not in (exclude or ())}
     missing = {name: state for name, state in parts.items() if state != "ok"}

@@ -26,5 +26,5 @@ _TEXT = {
     responses={200: {"content": _TEXT}, **problems(401, 403)},
 )
 def metrics(core: Core) -> Response:
-    """Return metrics of jobs, queue, workers, files, webhooks and requests. Where tokens are on, this needs the scope `admin`."""
+    """Return metrics of jobs, queue, workers, files, webhooks and requests. If tokens are required, the scope `admin` is needed."""
     return Response(core.metrics.exposition(core.jobs), media_type=MEDIA_TYPE)

@@ -32,9 +32,8 @@ _LOCATION = {"Location": {"description": "The new job's address.", "schema": {"t
 async def outputs(id: Id, request: Request, response: Response, jobs: Mine, key: Key) -> Job:
     """Queue a job that writes further files of a result, e.g. USD or another frame rate, without solving again.
 
-    Follow and download it like every other job; its `outputs_of` is the id of the first one. It has copies of what it needs, so
-    deleting the first job does not end it. The same request returns the same job with 200, unless that one failed or was
-    cancelled.
+    Follow and download it like any other job; its `outputs_of` is the id of the original job. It has its own copy of the data, so
+    the original job can be deleted. Repeating the request returns the same job with 200, unless that job failed or was cancelled.
     """
     wanted = await read_json(request, OutputRequest)
     job, new = await to_thread.run_sync(lambda: make_outputs(jobs, id, wanted, idempotency_key=key))

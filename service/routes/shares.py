@@ -25,11 +25,11 @@ router = APIRouter(prefix="/v1/jobs/{id}/shares", tags=["artifacts"])
     openapi_extra=body_of(ShareRequest, required=False),
 )
 async def create(id: Id, request: Request, jobs: Mine) -> Share:
-    """Create a link that shows one job's results, read-only, until it expires or is revoked.
+    """Create a read-only link to one job's results, valid until it expires or is revoked.
 
-    Whoever has the link can read the job's record and its files: no other job, no log, and nothing can be changed. The token is
-    sent as `Authorization: Bearer share.…`, also where the service requires no tokens. It is returned once; only its digest is
-    stored.
+    Anyone with the link can read the job's record and its files, but no log and no other job, and can change nothing. Send the
+    token as `Authorization: Bearer share.…`, even if the service requires no tokens. It is returned only once; the service
+    stores only its digest.
     """
     wanted = await read_json(request, ShareRequest)
     return await to_thread.run_sync(lambda: create_share(jobs, id, wanted))
@@ -37,7 +37,7 @@ async def create(id: Id, request: Request, jobs: Mine) -> Share:
 
 @router.get("", operation_id="list_shares", summary="List share links", responses=problems(401, 403, 404, 503))
 def shares(id: Id, request: Request, jobs: Mine) -> list[Share]:
-    """Return the valid links of a job, without their tokens; through a share link that link alone."""
+    """Return the valid links of a job, without their tokens. A request through a share link gets only that link."""
     own = request.scope.get("pliant.share")
     return [each for each in list_shares(jobs, id) if own in (None, each.id)]
 
@@ -50,5 +50,5 @@ def shares(id: Id, request: Request, jobs: Mine) -> list[Share]:
     responses=problems(401, 403, 404, 503),
 )
 def revoke(id: Id, share: Annotated[str, Path(description="The link's id.", max_length=64)], jobs: Mine) -> None:
-    """End a link at once."""
+    """Revoke a link immediately."""
     revoke_share(jobs, id, share)

@@ -1,11 +1,11 @@
-"""Resumable uploads of large inputs as raw bytes; a job names an upload instead of containing the file.
+"""Resumable uploads of large inputs as raw bytes; a job refers to an upload instead of containing the file.
 
-The headers are those of the IETF's draft "Resumable Uploads for HTTP" (draft-ietf-httpbis-resumable-upload): `Upload-Offset`,
-`Upload-Complete`, `Upload-Length`, `Upload-Limit`, HEAD returns the offset, PATCH appends, DELETE removes, 409 carries the
-right offset where they differ. Chosen over tus 1.0, which it is meant to replace, because a whole upload is one plain `PUT` that
-any HTTP client can send (`curl -T`), and over numbered parts as in S3, because the offset is the only state.
+The protocol is the IETF draft "Resumable Uploads for HTTP" (draft-ietf-httpbis-resumable-upload): the headers `Upload-Offset`,
+`Upload-Complete`, `Upload-Length` and `Upload-Limit`; HEAD returns the offset, PATCH appends, DELETE removes, and 409 contains
+the correct offset after a mismatch. Chosen over tus 1.0, which it is meant to replace, because a whole upload is one plain `PUT`
+that any HTTP client can send (`curl -T`), and over numbered parts as in S3, because the offset is the only state.
 Differences from the draft: the client chooses the id, as for jobs, so there is no interim response 104 to wait for; and a `PUT`
-with `Upload-Offset` appends like PATCH, because it is idempotent and so can be repeated after a lost answer.
+with `Upload-Offset` appends like PATCH, because it is idempotent and can be repeated after a lost response.
 """
 
 from __future__ import annotations
@@ -94,10 +94,10 @@ async def put(
     length: Length = None,
     digest: Digest = None,
 ) -> Upload:
-    """Stream raw bytes to the service's disk. A job then names the upload: `tracks_upload=ID` in place of the part `tracks`.
+    """Upload a file as raw bytes. A job then refers to it by `tracks_upload=ID` instead of containing the part `tracks`.
 
-    After an interruption get the offset with HEAD, and send the rest with `Upload-Offset`. Only a complete upload can be used.
-    It is removed a day after its last byte or last use, unless the operator chose another time.
+    After an interruption, get the offset with HEAD and send the rest with `Upload-Offset`. Only a complete upload can be used.
+    It is removed one day after its last byte or last use, unless the operator chose another period.
     """
     sending = Sending.of(request, offset=offset or 0, complete=complete, length=length, digest=digest)
     there = await _find_complete(uploads, id, sending)
@@ -184,11 +184,11 @@ class Sending:
     length: int | None
     """Bytes of the whole upload, if known."""
     sha256: str | None
-    """Of the whole upload, if stated."""
+    """Digest of the whole upload, if given."""
 
     @classmethod
     def of(cls, request: Request, *, offset: int, complete: str, length: int | None, digest: str | None) -> Sending:
-        """Read the headers; the length of the last body gives the length of the whole."""
+        """Read the headers; the length of the last body determines the length of the whole upload."""
         last, body = complete == "?1", request.headers.get("content-length", "")
         if length is None and last and body.isdigit():
             length = offset + int(body)
@@ -196,7 +196,7 @@ class Sending:
 
 
 async def _receive(request: Request, core: Service, *, uploads: Uploads, id: str, sending: Sending) -> None:
-    """Write the body as it arrives. If it breaks off, the bytes received are kept and the client resumes after them."""
+    """Write the body as it arrives. If it is interrupted, the bytes received are kept, and the client resumes after them."""
     capacity = await to_thread.run_sync(partial(_capacity, core, bounds_of(request)))
     held = uploads.write(id, offset=sending.offset, length=sending.length, capacity=capacity)
     try:
@@ -205,7 +205,7 @@ async def _receive(request: Request, core: Service, *, uploads: Uploads, id: str
         headers = {"Upload-Offset": error.expected, "Upload-Complete": "?0"}
         raise refused(error, type=MISMATCH, headers=headers) from error
     try:
-        # The writer holds the limit, over all requests together.
+        # The writer enforces the limit, over all requests together.
         async for batch in batches(request, max_bytes=ANY, stall_seconds=core.settings.stall_seconds):
             await to_thread.run_sync(writer.write, batch)
         if sending.last:
@@ -221,7 +221,7 @@ def _capacity(core: Service, bounds: Bounds) -> Capacity:
 
 
 async def _find_complete(uploads: Uploads, id: str, sending: Sending) -> Upload | None:
-    """Return the complete upload that equals what the client is about to send: the answer to its first request was lost."""
+    """Return the complete upload if it equals the body: the client repeats a request whose response was lost."""
     if sending.sha256 is None or sending.offset > 0:
         return None
     there = await to_thread.run_sync(uploads.find, id)
@@ -234,7 +234,7 @@ def _sha256(digest: str | None) -> str | None:
     Raises
     ------
     Refusal
-        It cannot be read.
+        The digest is malformed.
     """
     found = re.search(r"(?:^|,)\s*sha-256=:([^:]*):", digest or "")
     if found is None:
@@ -251,7 +251,6 @@ def _sha256(digest: str | None) -> str | None:
 
 
 def _describe(response: Response, upload: Upload, bounds: Bounds, uploads: Uploads) -> None:
-    """Set the headers that describe an upload."""
     headers = response.headers
     headers["Upload-Offset"] = str(upload.offset)
     headers["Upload-Complete"] = "?1" if upload.complete else "?0"

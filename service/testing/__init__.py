@@ -1,7 +1,7 @@
 """The service in memory, for tests of programs that use the SDK.
 
 ``Client(transport=InMemoryService())`` runs the real application in this process: the same routes, readers and records, with
-in-memory stores, and a thread in place of queue and workers. tests/client/test_contract.py runs on it and on a real service.
+in-memory stores, and a thread in place of queue and workers. tests/client/test_contract.py runs with it and with a real service.
 """
 
 from pliant.service.testing.in_memory import InMemoryService

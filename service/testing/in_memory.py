@@ -1,4 +1,4 @@
-"""The application on in-memory stores, as a transport of httpx."""
+"""The application on in-memory stores, as an httpx transport."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ class InMemoryService(httpx.BaseTransport, httpx.AsyncBaseTransport):
     steps : float
         Progress reports before a job ends, 20 ms apart; `math.inf` runs each job until it is cancelled.
     problem : Problem, optional
-        Every job fails with it.
+        Every job fails with this error.
     auth : {"off", "required"}
         Whether requests need a token; `create_token` makes one.
 
     Attributes
     ----------
     requests : list of httpx.Request
-        Received so far, with their bodies.
+        Requests received so far, with their bodies.
     jobs : Jobs
         The service's jobs, as the routes see them.
     worker : Worker
@@ -79,7 +79,7 @@ class InMemoryService(httpx.BaseTransport, httpx.AsyncBaseTransport):
         return self.tokens.create(name, scopes=scopes)[1]
 
     def stop(self) -> None:
-        """End the threads and remove the files; happens by itself when the service is no longer referenced."""
+        """End the threads and remove the files; called automatically when the service is no longer referenced."""
         self._finalizer()
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:

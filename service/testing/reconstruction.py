@@ -1,4 +1,4 @@
-"""What stands in for the solver: a function from points to shapes, and the worker thread that calls it."""
+"""A replacement for the solver, which maps points to shapes, and the worker thread that calls it."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from pliant.worker.jobs.service import Jobs
 from pliant.worker.store.memory import MemoryQueue
 
 Reconstruct = Callable[[NDArray[np.float64], Options], NDArray[np.float64]]
-"""From points (F, P, 2), NaN where hidden, and options to shapes (F, P, 3)."""
+"""Maps points (F, P, 2), NaN where hidden, and options to shapes (F, P, 3)."""
 
 STEP_SECONDS = 0.02
-"""Time between two steps of a job that runs in the worker thread."""
+"""Seconds between two steps of a job in the worker thread."""
 
 
 def flat(points: NDArray[np.float64], options: Options) -> NDArray[np.float64]:  # noqa: ARG001 - signature of `Reconstruct`
@@ -39,7 +39,7 @@ def flat(points: NDArray[np.float64], options: Options) -> NDArray[np.float64]: 
 
 
 class DeliveringQueue(MemoryQueue):
-    """A queue in memory that hands what is pushed to the worker thread."""
+    """An in-memory queue that delivers pushed jobs to the worker thread."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -57,13 +57,13 @@ class Worker:
     Parameters
     ----------
     jobs : Jobs
-        On in-memory stores.
+        The jobs, on in-memory stores.
     reconstruct : Reconstruct, optional
-        None runs the real solver.
+        Replaces the solver; None runs the real one.
     steps : float
         Progress reports before a job ends; `math.inf` runs it until it is cancelled.
     problem : Problem, optional
-        Every job fails with it.
+        Every job fails with this error.
     """
 
     def __init__(self, jobs: Jobs, reconstruct: Reconstruct | None, *, steps: float, problem: Problem | None) -> None:

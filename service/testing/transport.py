@@ -1,7 +1,7 @@
 """An httpx transport that calls an ASGI application in this process, for both kinds of client.
 
-`httpx.ASGITransport` has no synchronous counterpart and holds an answer back until it is complete, which an event stream
-never is. This one runs the application on an event loop of its own and hands out each piece as it is sent.
+`httpx.ASGITransport` has no synchronous counterpart and delays a response until it is complete, which an event stream never
+is. This transport runs the application on its own event loop and returns each piece as it is sent.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Request:
         return message
 
     async def piece(self) -> bytes | None:
-        """Return the next piece of the answer's body, None at its end."""
+        """Return the next piece of the response's body, None at its end."""
         while (message := await self._next()) is not None:
             if message.get("body"):
                 body: bytes = message["body"]
@@ -129,7 +129,7 @@ class Request:
 
 
 class Body(httpx.SyncByteStream, httpx.AsyncByteStream):
-    """The body of an answer, for either kind of client."""
+    """The body of a response, for either kind of client."""
 
     def __init__(self, loop: Loop, request: Request) -> None:
         self._loop = loop
@@ -153,5 +153,5 @@ class Body(httpx.SyncByteStream, httpx.AsyncByteStream):
 
 
 def response(start: Message, body: Body) -> httpx.Response:
-    """Return the answer whose head is `start`."""
+    """Return the response for the message `start` and a body."""
     return httpx.Response(start["status"], headers=start["headers"], stream=body)

@@ -1,4 +1,4 @@
-// Bundles src/ into dist/: one script, one stylesheet, names that change with their content, and a gzip twin of each.
+// Bundles src/ into dist/: scripts and stylesheets with content hashes in their names, and a gzip copy of each file.
 // The HTML files keep their names; they are the only files that a browser has to revalidate.
 
 import { build } from "esbuild";
@@ -20,7 +20,7 @@ const bundled = await build({
   entryPoints: entries,
   entryNames: "[name]-[hash]",
   chunkNames: "[name]-[hash]",
-  // The viewer with three.js is a chunk of its own: the page is usable before it has arrived.
+  // The viewer with three.js is a separate chunk: the page is usable before it is loaded.
   splitting: true,
   outdir: next,
   loader: { ".svg": "copy" },
@@ -28,13 +28,13 @@ const bundled = await build({
   minify: true,
   format: "esm",
   target: ["es2022"],
-  // three.js is MIT; its licence comment travels inside the bundle.
+  // three.js is under the MIT licence; its licence comment stays in the bundle.
   legalComments: "inline",
   metafile: true,
   logLevel: "warning",
 });
 
-// The viewer that a saved page holds: one classic script, because a page opened from a disk cannot load modules.
+// The viewer for saved pages: one classic script, because a page opened from disk cannot load modules.
 const alone = await build({
   absWorkingDir: here,
   entryPoints: ["src/standalone.ts"],
@@ -72,6 +72,6 @@ for (const name of await readdir(next)) {
   await writeFile(join(next, `${name}.gz`), packed);
 }
 
-// The finished folder appears at once: a service that reads dist/ never sees half a page.
+// The finished folder is moved into place: a service that reads dist/ never sees a partial build.
 await rm(final, { recursive: true, force: true });
 await rename(next, final);

@@ -1,4 +1,4 @@
-"""The container files, as far as they can be checked without an engine: commands exist, variables are read."""
+"""The container files, checked without a container engine: commands exist, variables are read."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EXAMPLE = (ROOT / "deploy" / "example.env").read_text()
 
 
 class Loader(yaml.SafeLoader):
-    """Reads Compose's own tag for a value that replaces that of the first file."""
+    """Reads Compose's own tag for a value that replaces the one in the first file."""
 
 
 Loader.add_constructor("!reset", lambda loader, node: loader.construct_sequence(node))
@@ -45,7 +45,7 @@ def valkey(tmp_path: Path) -> Iterator[Settings]:
 
 
 @pytest.mark.parametrize("name", ["api", "worker"])
-def test_the_services_start_existing_commands(name: str) -> None:
+def test_compose_services_start_existing_commands(name: str) -> None:
     assert starts(COMPOSE["services"][name]["command"])
 
 
@@ -65,7 +65,7 @@ def test_every_variable_that_is_set_is_also_read() -> None:
     assert "PLIANT_PAGE" in (ROOT / "build_page.py").read_text()
 
 
-def test_every_setting_and_the_credentials_of_s3_reach_the_containers() -> None:
+def test_settings_and_s3_credentials_reach_the_containers() -> None:
     for name in ("api", "worker"):
         assert COMPOSE["services"][name]["env_file"] == [{"path": ".env", "required": False}]
     offered = set(re.findall(r"^#?((?:PLIANT|AWS)_[A-Z_]+)=", EXAMPLE, re.MULTILINE))
@@ -81,7 +81,7 @@ def test_services_that_need_the_queue_wait_until_it_is_healthy() -> None:
         assert services[name]["depends_on"] == {"valkey": {"condition": "service_healthy"}}
 
 
-def test_the_health_check_of_the_worker_reports_whether_one_runs(valkey: Settings, tmp_path: Path) -> None:
+def test_the_worker_health_check_detects_a_running_worker(valkey: Settings, tmp_path: Path) -> None:
     script = COMPOSE["services"]["worker"]["healthcheck"]["test"]
     assert script[:3] == ["CMD", "python", "-c"]
     env = {**os.environ, **valkey.to_environment(), "PLIANT_QUEUE": "health"}
@@ -92,7 +92,7 @@ def test_the_health_check_of_the_worker_reports_whether_one_runs(valkey: Setting
     assert subprocess.run([sys.executable, "-c", script[3]], env=env, timeout=60).returncode == 0
 
 
-def test_an_acknowledged_write_is_on_disk_and_the_server_is_the_one_of_the_tests() -> None:
+def test_valkey_syncs_every_write_and_has_the_tested_version() -> None:
     command = COMPOSE["services"]["valkey"]["command"]
     assert command[command.index("--appendfsync") + 1] == "always"
     assert command[command.index("--maxmemory-policy") + 1] == "noeviction"
@@ -101,7 +101,7 @@ def test_an_acknowledged_write_is_on_disk_and_the_server_is_the_one_of_the_tests
     assert COMPOSE["services"]["valkey"]["image"] == f"valkey/valkey:{tested[0]}-alpine"
 
 
-def test_the_image_is_pinned_labelled_checked_and_keeps_no_wheels() -> None:
+def test_the_image_is_pinned_labelled_unprivileged_and_minimal() -> None:
     assert re.search(r"^ARG PYTHON=python:3\.\d+\.\d+-slim-\w+$", DOCKERFILE, re.MULTILINE)
     assert "HEALTHCHECK" in DOCKERFILE
     assert "/healthz" in DOCKERFILE
@@ -122,7 +122,7 @@ def test_with_tls_only_the_proxy_is_reachable() -> None:
 
 
 @pytest.mark.parametrize("unit", sorted((ROOT / "deploy" / "systemd").iterdir()), ids=lambda path: path.name)
-def test_the_units_start_existing_commands(unit: Path) -> None:
+def test_systemd_units_start_existing_commands(unit: Path) -> None:
     parser = configparser.ConfigParser(strict=False, interpolation=None)
     parser.optionxform = str  # type: ignore[assignment, method-assign]
     parser.read(unit)

@@ -1,6 +1,6 @@
-"""A whole installation, hit at every kind of moment; afterwards nothing is lost, doubled, half-written or left over.
+"""Faults of a complete installation at every stage; afterwards nothing is lost, duplicated, half-written or left over.
 
-What `python -m benchmarks.installation.faults` makes its table of. Faults that tests/worker commits on workers alone are not repeated here.
+`python -m benchmarks.installation.faults` tabulates the same faults. Those that tests/worker injects into workers alone are not repeated.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ WANTED = (
 )  # fmt: skip
 
 AGAIN = {"valkey_down", "api_uploading", "frozen", "stopped", "cancel_loading"}
-"""Those that `tests/hosts`, a worker that stops (`tests/worker`) or a cancelled job in another state covers as well."""
+"""Faults that are also covered by `tests/hosts`, by stopping a worker (`tests/worker`) or by cancelling in another state."""
 
 
 @pytest.fixture(scope="module", autouse=True)
 def root() -> Iterator[None]:
-    """Import the benchmarks as they import each other: from the root of the repository."""
+    """Make the benchmarks importable from the root of the repository, as they import each other."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(Path(__file__).parents[2]))
         yield
@@ -53,5 +53,5 @@ def test_nothing_is_lost_duplicated_half_written_or_left_over(instance: Any, nam
     assert instance.misfits() == []
 
 
-def test_every_fault_is_known(root: None) -> None:
+def test_every_tested_fault_is_defined_in_the_benchmarks(root: None) -> None:
     assert set(WANTED) < set(import_module("benchmarks.installation.faults").FAULTS)

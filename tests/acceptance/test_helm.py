@@ -1,4 +1,4 @@
-"""The Helm chart: rendered by Helm's own code, every object checked against Kubernetes' schemas, and what they start exists."""
+"""The Helm chart, rendered by Helm itself: objects match the Kubernetes schemas and start commands that exist."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ VALUES: dict[str, dict[str, Any]] = {"usual": {}, "everything": EVERYTHING, "ext
 
 
 def helm() -> Any:
-    """Return Helm's code, which a package of PyPI brings for Linux and macOS."""
+    """Return Helm, which a PyPI package provides for Linux and macOS."""
     if os.environ.get("CI"):
         import helm_python.chart as module
     else:
@@ -69,24 +69,24 @@ def containers(objects: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [each for spec in specs for each in (*spec["containers"], *spec.get("initContainers", ()))]
 
 
-def test_helm_finds_nothing_to_complain_of() -> None:
+def test_helm_lint_passes() -> None:
     report = helm().lint(CHART, strict=True)
     assert report["errors"] == []
     assert {message["error"] for message in report["messages"]} <= {"icon is recommended"}
 
 
-def test_every_object_is_one_that_kubernetes_accepts(objects: list[dict[str, Any]]) -> None:
+def test_every_object_matches_the_kubernetes_schemas(objects: list[dict[str, Any]]) -> None:
     validate = pytest.importorskip("kubernetes_validate", reason="pip install kubernetes-validate")
     checked = 0
     for each in objects:
         if each["apiVersion"].startswith(("keda.sh/", "monitoring.coreos.com/")):
-            continue  # their operators' own kinds; the tests below look at them
+            continue  # custom resources; the tests below check them
         validate.validate(each, KUBERNETES, strict=True)
         checked += 1
     assert checked >= 7
 
 
-def test_the_validation_would_notice() -> None:
+def test_the_schema_validation_detects_a_misspelt_field() -> None:
     validate = pytest.importorskip("kubernetes_validate", reason="pip install kubernetes-validate")
     wrong = of(rendered({}), "Deployment")["demo-api"]
     wrong["spec"]["template"]["spec"]["containers"][0]["livenes"] = {}
@@ -94,7 +94,7 @@ def test_the_validation_would_notice() -> None:
         validate.validate(wrong, KUBERNETES, strict=True)
 
 
-def test_containers_start_what_exists_with_variables_that_are_read(objects: list[dict[str, Any]]) -> None:
+def test_containers_run_existing_commands_with_known_variables(objects: list[dict[str, Any]]) -> None:
     ours = [each for each in containers(objects) if each["image"].startswith("pliant:")]
     assert {each["name"] for each in ours} == {"api", "first-token", "worker", "reconciler"}
     for each in ours:
@@ -105,7 +105,7 @@ def test_containers_start_what_exists_with_variables_that_are_read(objects: list
     assert {each["command"][3] for each in ours if each["command"][2] == "pliant.worker"} == {"work", "reconcile"}
 
 
-def test_no_container_has_more_rights_than_it_needs(objects: list[dict[str, Any]]) -> None:
+def test_containers_run_with_least_privilege(objects: list[dict[str, Any]]) -> None:
     for name, pod in pods(objects).items():
         assert pod["spec"]["securityContext"]["runAsNonRoot"] is True, name
         assert pod["spec"]["automountServiceAccountToken"] is False
@@ -117,7 +117,7 @@ def test_no_container_has_more_rights_than_it_needs(objects: list[dict[str, Any]
         assert "startupProbe" in each or each["name"] == "first-token"
 
 
-def test_selectors_find_their_pods_and_volumes_are_there(objects: list[dict[str, Any]]) -> None:
+def test_selectors_match_their_pods_and_mounted_volumes_exist(objects: list[dict[str, Any]]) -> None:
     labels = {name: pod["metadata"]["labels"] for name, pod in pods(objects).items()}
 
     def found(selector: dict[str, str]) -> list[str]:
@@ -135,7 +135,7 @@ def test_selectors_find_their_pods_and_volumes_are_there(objects: list[dict[str,
             assert {mount["name"] for mount in each["volumeMounts"]} <= volumes
 
 
-def test_a_worker_has_the_time_to_drain(objects: list[dict[str, Any]]) -> None:
+def test_workers_have_time_to_drain_before_termination(objects: list[dict[str, Any]]) -> None:
     pod = pods(objects)["demo-worker"]["spec"]
     grace = next(each["value"] for each in pod["containers"][0]["env"] if each["name"] == "PLIANT_STOP_GRACE")
     assert pod["terminationGracePeriodSeconds"] > int(grace) + 20
@@ -153,7 +153,7 @@ def test_workers_are_scaled_by_queued_and_running_jobs() -> None:
     assert of(rendered({}), "ScaledObject") == {}
 
 
-def test_the_first_token_is_one(tmp_path: Path) -> None:
+def test_the_generated_token_and_redis_url_are_well_formed(tmp_path: Path) -> None:
     objects = rendered({})
     assert _FORM.fullmatch(of(objects, "Secret")["demo-token"]["stringData"]["token"])
     url = of(objects, "Secret")["demo-redis"]["stringData"]["url"]
@@ -171,7 +171,7 @@ def test_the_first_token_is_one(tmp_path: Path) -> None:
         ({"api": {"replicas": 2}, "storage": {"pvc": {"accessMode": "ReadWriteOnce"}}}, "ReadWriteMany"),
     ],
 )
-def test_values_that_cannot_work_are_refused(values: dict[str, Any], words: str) -> None:
+def test_invalid_chart_values_are_refused(values: dict[str, Any], words: str) -> None:
     from helm_python.errors import HelmError
 
     def render() -> None:

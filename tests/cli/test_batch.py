@@ -50,7 +50,7 @@ def jobs_of(run: Run) -> list[dict[str, str]]:
     return json.loads(run("list", "--json").stdout)
 
 
-def test_a_folder_a_pattern_and_a_list_are_a_job_for_each_file(run: Run, takes: Path) -> None:
+def test_a_folder_a_pattern_or_a_list_submits_one_job_per_file(run: Run, takes: Path) -> None:
     for given in ([takes], [takes / "*.npz"], sorted(takes.glob("*.npz"))):
         ran = run("submit", *given, "--mesh", "none", "--json")
         assert ran.exit_code == 0, ran.output
@@ -60,7 +60,7 @@ def test_a_folder_a_pattern_and_a_list_are_a_job_for_each_file(run: Run, takes: 
     assert len(jobs_of(run)) == 3, "the second and third command found the jobs of the first"
 
 
-def test_a_name_that_no_service_takes_is_shortened(run: Run, takes: Path) -> None:
+def test_a_job_name_over_the_length_limit_is_shortened(run: Run, takes: Path) -> None:
     files = [(takes / "take-0.npz").rename(takes / f"{'x' * 230}.npz"), takes / "take-1.npz"]
     for _ in range(2):
         ran = run("submit", *files, "--mesh", "none")
@@ -68,13 +68,13 @@ def test_a_name_that_no_service_takes_is_shortened(run: Run, takes: Path) -> Non
     assert sorted(job["name"] for job in jobs_of(run)) == ["take-1", "x" * LONGEST_NAME]
 
 
-def test_another_option_or_key_makes_other_jobs(run: Run, takes: Path) -> None:
+def test_another_option_or_key_creates_new_jobs(run: Run, takes: Path) -> None:
     for more in ([], ["-O", "loss=huber"], ["--key", "again"]):
         assert run("submit", takes, "--mesh", "none", *more).exit_code == 0
     assert len(jobs_of(run)) == 9
 
 
-def test_whatever_changes_the_jobs_makes_other_jobs(
+def test_changed_inputs_priority_or_webhook_secret_create_new_jobs(
     run: Run, takes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mesh, truth, rotations = (tmp_path / name for name in ("mesh.npz", "truth.npz", "rotations.npz"))
@@ -103,7 +103,7 @@ def test_whatever_changes_the_jobs_makes_other_jobs(
     assert number_of_jobs() == 12, "the content counts, not the path"
 
 
-def test_results_lie_in_a_folder_for_each_and_a_second_run_goes_on(run: Run, takes: Path, tmp_path: Path) -> None:
+def test_results_get_a_folder_per_file_and_a_second_run_resumes(run: Run, takes: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     first = run("submit", takes, "--mesh", "none", "-o", out)
     assert first.exit_code == 0, first.output
@@ -117,7 +117,7 @@ def test_results_lie_in_a_folder_for_each_and_a_second_run_goes_on(run: Run, tak
     assert len(jobs_of(run)) == 4
 
 
-def test_files_of_other_content_are_kept_unless_forced(run: Run, takes: Path, tmp_path: Path) -> None:
+def test_existing_files_are_kept_unless_forced(run: Run, takes: Path, tmp_path: Path) -> None:
     kept = tmp_path / "out" / "take-0" / "shapes.npz"
     kept.parent.mkdir(parents=True)
     kept.write_text("mine")
@@ -138,7 +138,7 @@ def test_files_of_other_content_are_kept_unless_forced(run: Run, takes: Path, tm
     assert np.load(kept)["shapes"].shape == (5, 12, 3)
 
 
-def test_a_file_that_is_refused_has_its_row_and_stops_nothing(run: Run, takes: Path) -> None:
+def test_a_rejected_file_is_reported_and_the_others_continue(run: Run, takes: Path) -> None:
     np.savez(takes / "take-1.npz", tracks=np.ones((2, 9, 2)))
     ran = run("submit", takes, "--mesh", "none", "--wait")
     assert ran.exit_code == Exit.FAILED
@@ -153,7 +153,7 @@ def test_a_file_that_is_refused_has_its_row_and_stops_nothing(run: Run, takes: P
     assert len(jobs_of(run)) == 2
 
 
-def test_a_file_whose_key_is_taken_has_its_row_and_stops_nothing(
+def test_a_file_with_a_used_key_is_reported_and_the_others_continue(
     run: Run, takes: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Batch, "_key_of", lambda _, file, *__: str(file.stem == "take-2"))
@@ -168,7 +168,7 @@ def test_a_file_whose_key_is_taken_has_its_row_and_stops_nothing(
     assert len(jobs_of(run)) == 2
 
 
-def test_a_missing_token_ends_it_at_the_first_file(takes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_token_ends_the_batch_at_the_first_file(takes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("PLIANT_TOKEN", raising=False)
     service = InMemoryService(auth="required")
     ran = CliRunner().invoke(app, ["submit", str(takes), "--mesh", "none"], obj=Session(transport=service))
@@ -176,7 +176,7 @@ def test_a_missing_token_ends_it_at_the_first_file(takes: Path, monkeypatch: pyt
     assert [request.url.path for request in service.requests] == ["/v1/jobs"]
 
 
-def test_what_belongs_to_one_job_is_refused(run: Run, takes: Path, tmp_path: Path) -> None:
+def test_single_job_options_empty_inputs_and_name_clashes_are_rejected(run: Run, takes: Path, tmp_path: Path) -> None:
     for more in (["--id", "mine"], ["--name", "a name"], ["--region", takes / "take-0.npz"]):
         ran = run("submit", takes / "take-0.npz", takes / "take-1.npz", *more)
         assert ran.exit_code == Exit.REFUSED, more
@@ -201,7 +201,7 @@ def words(ran: Result) -> str:
     return " ".join(ran.stderr.split())
 
 
-def test_ids_are_printed_at_submission_and_lines_while_waiting(
+def test_ids_are_printed_at_submission_and_progress_while_waiting(
     run: Run, service: InMemoryService, takes: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service.worker.steps = 30
@@ -219,7 +219,7 @@ def test_ids_are_printed_at_submission_and_lines_while_waiting(
 
 
 @pytest.mark.parametrize(("count", "rest"), [(3, " and 2 others continue"), (2, " and 1 other continue")])
-def test_ctrl_c_while_waiting_prints_how_to_return(
+def test_ctrl_c_while_waiting_prints_how_to_resume(
     run: Run, service: InMemoryService, takes: Path, monkeypatch: pytest.MonkeyPatch, count: int, rest: str
 ) -> None:
     def interrupt(*_: object, **__: object) -> None:
@@ -233,7 +233,7 @@ def test_ctrl_c_while_waiting_prints_how_to_return(
     first = ids[0]
     assert (ran.exit_code, len(ids)) == (Exit.INTERRUPTED, count)
     assert words(ran).partition("error ")[2] == (
-        f"Interrupted. Job {first}{rest}: the same command again returns to all of them, "
+        f"Interrupted. Job {first}{rest}: repeat the command to follow all of them, "
         f"`pliant watch {first}` follows this one, `pliant cancel {first}` stops it."
     )
     for each in ids:
@@ -241,7 +241,7 @@ def test_ctrl_c_while_waiting_prints_how_to_return(
     assert len(jobs_of(run)) == count
 
 
-def test_ctrl_c_while_sending_names_the_jobs_that_exist(run: Run, takes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_while_submitting_names_the_created_jobs(run: Run, takes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from pliant.client import Client
 
     submit = Client.submit

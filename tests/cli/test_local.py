@@ -30,18 +30,18 @@ from pliant.worker.settings import NUMERICAL_THREADS, Settings
 from serving import free_port, until
 from typer.testing import CliRunner
 
-doctor = importlib.import_module("pliant.cli.doctor")  # the name in the package is the command's
+doctor = importlib.import_module("pliant.cli.doctor")  # the package attribute of this name is the command
 up = importlib.import_module("pliant.cli.up")
 
 
-def test_options_are_json_where_they_can_be() -> None:
+def test_options_are_parsed_as_json_where_possible() -> None:
     given = ["loss=l1", "fps=12.5", "basis_size=null", "refine_rotations=false", " seed = 3", "a=b=c"]
     expected = {"loss": "l1", "fps": 12.5, "basis_size": None, "refine_rotations": False, "seed": 3, "a": "b=c"}
     assert parse_options(given) == expected
     assert parse_options(None) == {}
 
 
-def test_a_mesh_is_a_file_if_there_is_one(tmp_path: Path) -> None:
+def test_a_mesh_argument_is_a_path_if_the_file_exists(tmp_path: Path) -> None:
     (tmp_path / "3x4").write_text("")
     assert file_or_word(str(tmp_path / "3x4")) == tmp_path / "3x4"
     assert file_or_word("3x4") == "3x4"
@@ -89,11 +89,11 @@ def test_the_command_line_takes_precedence_over_the_environment(monkeypatch: pyt
     assert (up.chosen(Path("here"), 5).workers, up.chosen(Path("here"), 5).data) == (5, Path("here"))
 
 
-def test_the_service_logs_warnings_unless_a_level_is_given_anywhere(
+def test_the_service_logs_warnings_unless_a_level_is_configured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def level() -> str | None:
-        """Return the level that `pliant up` sets; None: the service reads it where it was given."""
+        """Return the level that `pliant up` sets, or None if the service reads it from its configuration."""
         return up.service_child(Settings(), "127.0.0.1", 80, "http://127.0.0.1:80", auth="off").env.get(
             "PLIANT_LOG_LEVEL"
         )
@@ -111,7 +111,7 @@ def test_the_service_logs_warnings_unless_a_level_is_given_anywhere(
     assert (level(), ServiceSettings.from_environment().log_level) == (None, "debug")
 
 
-def test_a_service_that_ends_instead_of_starting_is_reported() -> None:
+def test_a_service_that_exits_during_startup_is_reported() -> None:
     process = subprocess.Popen([sys.executable, "-c", "raise SystemExit(7)"])
     process.wait()
     with pytest.raises(Unreachable, match="ended with code 7"):
@@ -154,7 +154,7 @@ def test_a_service_that_is_not_ready_in_time_gives_its_reason(monkeypatch: pytes
             process.wait()
 
 
-def test_starting_others_needs_none_of_their_libraries() -> None:
+def test_up_does_not_import_the_libraries_of_its_child_processes() -> None:
     code = "import sys, pliant.cli.up, pliant.service.settings, pliant.worker.processes.supervisor; print(*sys.modules)"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"fastapi", "httpx", "numpy", "redis", "rq"} & set(ran.stdout.split())
@@ -301,7 +301,7 @@ def test_doctor_checks_the_service() -> None:
     assert "pliant up" in found.advice
 
 
-def test_without_the_server_doctor_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_says_how_to_install_a_missing_server(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "redis", None)
     findings = {finding.what: finding for finding in doctor.check_packages()}
     assert (findings["packages"].verdict, findings["server"].verdict) == ("good", "note")

@@ -1,4 +1,4 @@
-"""What must work where Linux's and macOS's own modules are absent, as on Windows: the SDK, and `pliant solve` of an npz file."""
+"""The SDK and `pliant solve` of an npz file work without the modules of Linux and macOS, as on Windows."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def run(code: str, *arguments: str, folder: Path) -> subprocess.CompletedProcess
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
 
 
-def test_the_sdk_imports_and_an_npz_file_is_solved(tmp_path: Path) -> None:
+def test_without_unix_modules_the_sdk_imports_and_npz_files_are_solved(tmp_path: Path) -> None:
     random = np.random.default_rng(3)
     np.savez(tmp_path / "tracks.npz", tracks=random.normal(size=(16, 2)) * 50 + random.normal(size=(5, 16, 2)))
     ran = run(IMPORTS + COMMAND, "tracks.npz", folder=tmp_path)
@@ -41,7 +41,7 @@ def test_the_sdk_imports_and_an_npz_file_is_solved(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "shapes.npz").exists()
 
 
-def test_what_needs_the_sandbox_is_refused_with_what_to_do(tmp_path: Path) -> None:
+def test_formats_that_need_the_sandbox_are_rejected_with_a_remedy(tmp_path: Path) -> None:
     (tmp_path / "tracks.csv").write_text("frame,point,x,y\n0,0,1,2\n")
     ran = run(COMMAND, "tracks.csv", folder=tmp_path)
     assert ran.returncode != 0

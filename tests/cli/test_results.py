@@ -52,7 +52,7 @@ def job(run: Run, tmp_path: Path) -> str:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A result as `pliant solve` leaves it, with a file beside it that is nobody's business."""
+    """A result as `pliant solve` writes it, beside a file that must not be served."""
     held = tmp_path_factory.mktemp("face")
     inputs, solution, options = make_result(outputs="glb")
     report = build_report(inputs, solution, options, metrics={"e3d_frame": 0.5, "rotation_degrees": float("inf")})
@@ -64,7 +64,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 TAKEN = "Address already in use"
 
 
-def test_further_files_are_made_and_downloaded(run: Run, job: str, tmp_path: Path) -> None:
+def test_result_make_creates_and_downloads_further_outputs(run: Run, job: str, tmp_path: Path) -> None:
     ran = run("result", job, "--make", "mdd", "--make", "csv", "--fps", "50", "-o", tmp_path / "more")
     assert ran.exit_code == 0, ran.output
     assert {path.name for path in (tmp_path / "more").iterdir()} == {
@@ -80,7 +80,7 @@ def test_further_files_are_made_and_downloaded(run: Run, job: str, tmp_path: Pat
     )
 
 
-def test_the_inputs_run_again_with_other_options(run: Run, job: str) -> None:
+def test_rerun_uses_the_same_inputs_with_other_options(run: Run, job: str) -> None:
     ran = run("rerun", job, "-O", "loss=l2", "--json")
     assert ran.exit_code == 0, ran.output
     again = json.loads(ran.stdout)
@@ -89,7 +89,7 @@ def test_the_inputs_run_again_with_other_options(run: Run, job: str) -> None:
     assert run("rerun", job, "-O", "stride=3").exit_code == Exit.REFUSED
 
 
-def test_a_link_is_made_listed_and_revoked(run: Run, job: str, service: InMemoryService) -> None:
+def test_share_links_are_created_listed_and_revoked(run: Run, job: str, service: InMemoryService) -> None:
     made = run("share", job, "--days", "2")
     assert made.exit_code == 0, made.output
     address = made.stdout.strip()
@@ -113,7 +113,7 @@ def test_a_link_is_made_listed_and_revoked(run: Run, job: str, service: InMemory
     )
 
 
-def test_both_roads_name_the_object_after_the_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_solve_and_submit_write_equal_meshes_named_as_the_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv("PLIANT_TOKEN", raising=False)
     given = tmp_path / "my take.npz"
     np.savez(given, tracks=np.random.default_rng(0).normal(size=(4, 12, 2)))
@@ -130,7 +130,7 @@ def test_both_roads_name_the_object_after_the_file(monkeypatch: pytest.MonkeyPat
     assert record.json()["name"] == "my take"
 
 
-def test_the_viewer_serves_one_result_under_its_token_alone(folder: Path) -> None:
+def test_the_viewer_serves_only_its_result_and_only_under_its_token(folder: Path) -> None:
     client = TestClient(create_viewer(folder, "secret"), base_url="http://127.0.0.1:1")
     record = client.get("/secret/v1/jobs/local").json()
     assert (record["status"], record["name"], record["metrics"]) == ("succeeded", folder.name, {"e3d_frame": 0.5})
@@ -146,7 +146,7 @@ def test_the_viewer_serves_one_result_under_its_token_alone(folder: Path) -> Non
     assert client.post("/secret/v1/jobs/local").status_code == 405
 
 
-def test_what_is_no_result_is_refused(run: Run, folder: Path, tmp_path: Path) -> None:
+def test_view_rejects_folders_without_a_result_and_busy_ports(run: Run, folder: Path, tmp_path: Path) -> None:
     with socket.socket() as busy:
         busy.bind(("127.0.0.1", 0))
         busy.listen()

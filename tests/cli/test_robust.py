@@ -73,7 +73,7 @@ def words(ran: Result) -> str:
 
 
 def refusal(sentence: str, code: str = "invalid_argument") -> str:
-    """What the command line prints: the sentence, and where its code is explained."""
+    """Return what the command line prints: the sentence, and where its code is explained."""
     return f"error {sentence} More about this error: pliant explain {code}"
 
 
@@ -140,7 +140,7 @@ LISTED = "`pliant options` lists every option."
         ("submit TRACKS -O los=l1", f"options: los: there is no such option (did you mean loss?). {LISTED}"),
     ],
 )
-def test_wrong_paths_and_options(run: Run, tracks: Path, tmp_path: Path, arguments: str, sentence: str) -> None:
+def test_bad_paths_or_options_are_errors(run: Run, tracks: Path, tmp_path: Path, arguments: str, sentence: str) -> None:
     (tmp_path / "folder").mkdir()
     names = {
         "FILM": str(tracks),
@@ -160,8 +160,8 @@ def test_wrong_paths_and_options(run: Run, tracks: Path, tmp_path: Path, argumen
     assert words(ran) == refusal(filled(sentence), code)
 
 
-def test_a_path_that_the_system_rejects(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Permissions do not bind root, so the system's answers are put in their place."""
+def test_unwritable_folders_are_rejected(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Permissions do not restrict root, so the system calls are replaced."""
     folder = tmp_path / "locked"
     folder.mkdir()
     monkeypatch.setattr(os, "access", lambda *_: False)
@@ -174,7 +174,7 @@ def test_a_path_that_the_system_rejects(monkeypatch: pytest.MonkeyPatch, tmp_pat
         output_folder(tmp_path / "new", force=False)
 
 
-def test_an_unreadable_file(run: Run, tracks: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_unreadable_files_are_rejected(run: Run, tracks: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("pliant.client.multipart.os.access", lambda *_: False)
     ran = run("solve", tracks, "-o", tmp_path / "out")
     assert ran.exit_code == Exit.REFUSED
@@ -214,7 +214,7 @@ def test_existing_results_are_kept_unless_forced(run: Run, tracks: Path, tmp_pat
     assert np.load(out / "shapes.npz")["shapes"].shape == (5, 12, 3)
 
 
-def test_any_other_file_of_a_result_is_kept_unless_forced(run: Run, tracks: Path, tmp_path: Path) -> None:
+def test_an_existing_glb_file_is_kept_unless_forced(run: Run, tracks: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     (out / "shapes.glb").write_text("mine")
@@ -232,7 +232,7 @@ def test_any_other_file_of_a_result_is_kept_unless_forced(run: Run, tracks: Path
     ("given", "existing", "more"),
     [("tracks.npz", "shapes.glb", ()), ("film.gif", "contact_sheet.jpg", ()), ("tracks.npz", "shapes.mdd", ("-O", 'outputs=["mdd"]'))],
 )  # fmt: skip
-def test_solve_keeps_every_file_that_it_would_replace(
+def test_solve_does_not_replace_existing_files(
     run: Run, tracks: Path, tmp_path: Path, given: str, existing: str, more: tuple[str, ...]
 ) -> None:
     (tmp_path / "film.gif").write_bytes(b"GIF89a")
@@ -246,7 +246,7 @@ def test_solve_keeps_every_file_that_it_would_replace(
     assert [path.name for path in (tmp_path / "out").iterdir()] == [existing]
 
 
-def test_solve_leaves_files_that_no_result_has(run: Run, tracks: Path) -> None:
+def test_solve_leaves_files_that_it_does_not_write(run: Run, tracks: Path) -> None:
     for name in ("shapes.mdd", "contact_sheet.jpg"):
         (tracks.parent / name).write_text("mine")
     ran = run("solve", tracks, "-o", tracks.parent, "-O", 'outputs=["mat"]', *FAST)
@@ -254,7 +254,7 @@ def test_solve_leaves_files_that_no_result_has(run: Run, tracks: Path) -> None:
     assert (tracks.parent / "shapes.mdd").read_text() == "mine"
 
 
-def test_the_demonstration_replaces_files_of_a_folder_that_was_named_only_if_forced(
+def test_demo_replaces_files_in_a_named_folder_only_if_forced(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def render(_: object, folder: Path) -> None:
@@ -273,7 +273,7 @@ def test_the_demonstration_replaces_files_of_a_folder_that_was_named_only_if_for
         assert json.loads(ran.stderr)["detail"] == f"rendered into {folder}", more
 
 
-def test_jobs_are_named_by_prefix_or_as_the_last_one(run: Run, tracks: Path) -> None:
+def test_jobs_can_be_given_by_id_prefix_or_as_the_last_one(run: Run, tracks: Path) -> None:
     for name in ("apple-1", "apple-2", "banana-1"):
         assert run("submit", tracks, "-m", "none", "--id", name).exit_code == 0
     assert json.loads(run("status", "ban", "--json").stdout)["id"] == "banana-1"
@@ -304,7 +304,7 @@ def test_the_id_is_printed_before_waiting(run: Run, tracks: Path, service: InMem
     run("cancel", "early")
 
 
-def test_a_line_is_printed_regularly_without_a_terminal(
+def test_progress_lines_are_printed_without_a_terminal(
     run: Run, tracks: Path, service: InMemoryService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service.worker.steps = 40
@@ -317,7 +317,7 @@ def test_a_line_is_printed_regularly_without_a_terminal(
 
 
 @pytest.mark.parametrize("command", [["up"], ["work"], ["token", "list"], ["demo"], ["fsck"]], ids=" ".join)
-def test_commands_of_the_server_name_what_to_install(
+def test_server_commands_say_what_to_install(
     command: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -333,7 +333,7 @@ def test_commands_of_the_server_name_what_to_install(
 @pytest.mark.parametrize(
     "command", [["fsck"], ["backup", "copy"], ["token", "list"], ["token", "revoke", "t1"]], ids=" ".join
 )
-def test_no_installation_is_refused_and_nothing_is_created(
+def test_commands_reject_a_missing_installation_and_create_nothing(
     command: list[str], run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -355,7 +355,7 @@ def test_an_unknown_scope_is_refused_before_the_installation_is_opened(run: Run,
     assert not (tmp_path / "data").exists()
 
 
-def test_a_module_of_the_server_that_is_missing_elsewhere(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_server_module_says_what_to_install(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object, **__: object) -> None:
         raise ModuleNotFoundError("No module named 'redis'", name="redis")
 
@@ -406,7 +406,7 @@ main()
 def test_numerical_libraries_are_loaded_after_their_threads_are_limited(
     tmp_path: Path, command: tuple[str, ...]
 ) -> None:
-    """They read their variables once: more threads than the solver's own slow down a busy machine many times."""
+    """They read their variables once; more threads than the solver's own slow down a busy machine many times over."""
     environment = {name: value for name, value in os.environ.items() if name not in NUMERICAL_THREADS}
     ran = subprocess.run(
         [sys.executable, "-c", LOADED, *command], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60, check=False
@@ -414,7 +414,7 @@ def test_numerical_libraries_are_loaded_after_their_threads_are_limited(
     assert (ran.returncode, ran.stdout) == (Exit.REFUSED, "1\n"), ran.stderr
 
 
-def test_ctrl_c_while_solving(tmp_path: Path) -> None:
+def test_ctrl_c_while_solving_leaves_no_output(tmp_path: Path) -> None:
     from pliant.solver.gallery import face
 
     np.savez(tmp_path / "face.npz", tracks=face(60, 3000).tracks.points)
@@ -442,7 +442,7 @@ def test_ctrl_c_while_waiting_prints_how_to_resume(
     run("cancel", "slow")
 
 
-def test_an_error_code_is_explained(run: Run) -> None:
+def test_explain_prints_cause_and_remedy_of_an_error_code(run: Run) -> None:
     code = ProblemCode.TOO_FEW_FRAMES
     assert run("explain", "too_few_frames").stdout == (
         f"{code.heading}: too_few_frames (HTTP status 422)\n{code.cause}\nWhat to do: {code.remedy}\n"
@@ -461,8 +461,8 @@ def test_an_error_code_is_explained(run: Run) -> None:
     )
 
 
-def test_every_refusal_ends_with_where_it_is_explained(run: Run, tracks: Path, tmp_path: Path) -> None:
-    """From this machine the command that explains it, from a service its page, which answers; JSON has a member for it."""
+def test_errors_end_with_where_they_are_explained(run: Run, tracks: Path, tmp_path: Path) -> None:
+    """Local errors name `pliant explain`, errors of a service its page; JSON has a field for it."""
     np.savez(tmp_path / "short.npz", tracks=np.ones((2, 9, 2)))
     sentence = "error tracks: expected at least 3 frames, got 2. Track a longer clip. More about this error: "
     ran = run("inspect", tmp_path / "short.npz")

@@ -39,7 +39,7 @@ def test_running_and_queued_jobs_come_first(service: InMemoryService) -> None:
         assert "redis ok" in text
 
 
-def test_once_and_json_end_by_themselves(service: InMemoryService) -> None:
+def test_top_once_and_json_print_and_exit(service: InMemoryService) -> None:
     ran = CliRunner().invoke(app, ["top", "--once"], obj=Session(transport=service))
     assert (ran.exit_code, "0 running, 0 queued" in ran.stdout) == (0, True), ran.output
     ran = CliRunner().invoke(app, ["top", "--json"], obj=Session(transport=service))

@@ -35,7 +35,7 @@ def test_a_film_becomes_tracks_and_a_preview(tmp_path: Path) -> None:
     assert "Only 4 frames" in ran.stderr
 
 
-def test_a_line_is_printed_regularly_without_a_terminal(
+def test_progress_lines_are_printed_without_a_terminal(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module = importlib.import_module("pliant.cli.track")

@@ -17,7 +17,7 @@ from pliant.schemas.job import Interpretation, Job, Status
 from pliant.schemas.options import Options
 from pliant.worker.jobs.finished import Finished
 
-REASON = "The camera turned by 9° only; depth needs 20° or more."
+REASON = "The camera turned by only 9°; depth needs 20° or more."
 TRUST = "Expected error about 4 % of the object's size; depth rests on 9° of turn."
 LAST = ["Use with care  " + TRUST + " Converged.", "  " + REASON]
 
@@ -63,7 +63,7 @@ def test_solve_states_the_camera(capsys: pytest.CaptureFixture[str]) -> None:
     assert json.loads(capsys.readouterr().out)["camera_sentence"] == lens
 
 
-def test_a_job_ends_with_the_verdict_and_an_old_one_with_its_outcome(capsys: pytest.CaptureFixture[str]) -> None:
+def test_shown_jobs_end_with_the_verdict_and_old_ones_with_the_outcome(capsys: pytest.CaptureFixture[str]) -> None:
     show_job(job(verdict="with_care", verdict_reasons=[REASON], trust_sentence=TRUST), as_json=False)
     shown = capsys.readouterr().out
     assert shown.splitlines()[-2:] == LAST
@@ -75,7 +75,7 @@ def test_a_job_ends_with_the_verdict_and_an_old_one_with_its_outcome(capsys: pyt
     assert verdict_lines(job()) == []
 
 
-def test_the_list_of_jobs_has_the_verdict(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_job_list_shows_verdicts(capsys: pytest.CaptureFixture[str]) -> None:
     show_jobs([job(verdict="do_not_use"), job()], as_json=False)
     heading, bad, old = capsys.readouterr().out.splitlines()
     assert "verdict" in heading
@@ -83,9 +83,7 @@ def test_the_list_of_jobs_has_the_verdict(capsys: pytest.CaptureFixture[str]) ->
     assert old.split()[:2] == ["job", "succeeded"]
 
 
-def test_the_demonstration_states_what_its_figures_mean(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_demo_explains_its_metrics(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     judged = job(verdict="with_care", verdict_reasons=[REASON], trust_sentence=TRUST)
     report(judged, dict.fromkeys(MEANINGS, 0.04), {}, good=True, url=None, as_json=False)
@@ -97,18 +95,18 @@ def test_the_demonstration_states_what_its_figures_mean(
         assert "0.04" in row
 
 
-def test_one_headline_error_with_the_same_meaning_everywhere() -> None:
+def test_headline_error_and_metric_meanings_match_the_web_page() -> None:
     headline = next(iter(METRIC_MEANINGS))
     assert headline == next(iter(MEANINGS)) == "e3d_frame"
     assert MEANINGS[headline].startswith(METRIC_MEANINGS[headline])
     page = (Path(__file__).parents[2] / "service" / "web" / "src" / "results.ts").read_text()
     words = dict(re.findall(r'^  (\w+): \["(?:[^"]*)", "([^"]*)"\],$', page, flags=re.MULTILINE))
     assert list(words) == list(METRIC_MEANINGS)
-    spoken = {name: meaning.replace("\\u00a0", " ") for name, meaning in words.items()}  # lines do not end before %
+    spoken = {name: meaning.replace("\\u00a0", " ") for name, meaning in words.items()}  # no line break before %
     assert {name: meaning.removeprefix("3-D error: ") for name, meaning in METRIC_MEANINGS.items()} == spoken
 
 
-def test_the_headline_error_stands_first() -> None:
+def test_the_metrics_table_starts_with_the_headline_error() -> None:
     table = metrics_table({"of_a_newer_service": 1.0, "reprojection_rms": 0.5, "e3d_sequence": 0.2, "e3d_frame": 0.1})
     names, _, meanings = (list(column.cells) for column in table.columns)
     assert names == ["e3d_frame", "e3d_sequence", "reprojection_rms", "of_a_newer_service"]
@@ -116,7 +114,7 @@ def test_the_headline_error_stands_first() -> None:
 
 
 @pytest.mark.parametrize("columns", ["40", "80", "200"])
-def test_ids_are_whole_on_a_narrow_terminal(
+def test_ids_are_not_truncated_on_narrow_terminals(
     columns: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", columns)
@@ -141,7 +139,7 @@ def test_ids_are_whole_on_a_narrow_terminal(
     assert known.id in capsys.readouterr().out
 
 
-def test_the_table_of_a_batch_has_verdicts_in_words_and_the_first_reason(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_batch_table_shows_each_verdict_and_its_first_reason(capsys: pytest.CaptureFixture[str]) -> None:
     batch = Batch(
         files=[], shared={}, options={}, key="", priority="normal", timeout=None, output=None, force=False, wait=True,
         url="http://pliant.test", session=Session(),

@@ -51,11 +51,11 @@ def moving_points(frames: int = 6, count: int = 16) -> np.ndarray:
 
 
 Door = tuple[str, str]
-"""Which client, and what it asks."""
+"""Which client, and which server it uses."""
 
 DOORS: list[Door] = [("sync", "double"), ("async", "double"), ("async", "service")]
 EVERY_DOOR = pytest.mark.parametrize("door", [*DOORS, ("sync", "service")], indirect=True, ids="-".join)
-"""The synchronous client is generated from the other one: what differs between their transports is asked of the service, too."""
+"""The synchronous client is generated from the asynchronous one, so only tests that depend on the transport run it on the service."""
 
 
 @pytest.fixture(params=DOORS, ids="-".join)
@@ -70,7 +70,7 @@ def kind(door: Door) -> str:
 
 @pytest.fixture
 def asked(request: pytest.FixtureRequest, door: Door) -> dict[str, Any]:
-    """What a client is made with: the double, or the address of a real service."""
+    """Arguments of a client: the in-memory double, or the address of a real service."""
     if door[1] == "double":
         return {"url": "http://pliant.test", "transport": InMemoryService(), "retries": PATIENT}
     return {"url": request.getfixturevalue("service_url"), "retries": PATIENT}
@@ -78,7 +78,7 @@ def asked(request: pytest.FixtureRequest, door: Door) -> dict[str, Any]:
 
 @contextmanager
 def opened(kind: str, asked: dict[str, Any]) -> Iterator[Client]:
-    """Open a client of either kind; the asynchronous one is made to block, so that the tests need not know."""
+    """Open a client of either kind; the asynchronous one is wrapped to block, so that both share the tests."""
     if kind == "sync":
         with Client(**asked) as client:
             yield client
@@ -136,7 +136,7 @@ def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) ->
     assert set(everything) == {artifact.name for artifact in result.job.artifacts}
 
 
-def test_a_result_has_the_names_of_its_points_and_of_its_object(client: Client, tmp_path: Path) -> None:
+def test_results_keep_point_names_and_the_job_name(client: Client, tmp_path: Path) -> None:
     heads = [f"{part}_{axis}" for part in ("Nose", "chin", "brow", "tip") for axis in "xy"]
     rows = np.random.default_rng(0).uniform(0, 100, (1, 8)) + np.arange(5)[:, None]
     text = "\n".join(",".join(map(str, row)) for row in [heads, *rows.tolist()])
@@ -305,7 +305,7 @@ def test_large_inputs_are_uploaded_first_with_the_same_result(client: Client, mo
     assert caught.value.code == "too_few_frames"
 
 
-def test_further_files_are_made_of_the_stored_result_without_solving(client: Client, tmp_path: Path) -> None:
+def test_outputs_are_made_from_the_stored_result_without_solving(client: Client, tmp_path: Path) -> None:
     solved = client.submit(moving_points(), options={**FAST, "outputs": ("csv",)}, name="sheet")
     result = solved.wait(timeout=60)
     more = solved.make_outputs(["mdd", "glb"], fps=50)
@@ -327,7 +327,7 @@ def test_further_files_are_made_of_the_stored_result_without_solving(client: Cli
         solved.make_outputs(["obj"])
 
 
-def test_further_files_are_refused_where_there_is_no_result(client: Client) -> None:
+def test_further_outputs_need_a_solved_job_and_valid_arguments(client: Client) -> None:
     job = client.submit(**long_request())
     with pytest.raises(NotAllowedNow, match="Wait until it has succeeded"):
         job.make_outputs(["obj"])
@@ -344,7 +344,7 @@ def test_further_files_are_refused_where_there_is_no_result(client: Client) -> N
         more.make_outputs(["obj"])
 
 
-def test_kept_inputs_run_again_with_other_options(client: Client) -> None:
+def test_stored_inputs_can_be_rerun_with_other_options(client: Client) -> None:
     first = client.submit(moving_points(), options={**FAST, "stride": 2}, name="walk")
     shapes = first.wait(timeout=60).shapes
     again = first.run_again({**FAST, "loss": "l2"})
@@ -388,7 +388,7 @@ def test_a_share_link_reads_one_result_until_it_is_revoked(
 
 
 @pytest.mark.parametrize("door", DOORS[:2], indirect=True, ids="-".join)
-def test_a_job_that_failed_is_failed_after_the_wait(kind: str) -> None:
+def test_waiting_for_a_failed_job_raises_and_updates_its_status(kind: str) -> None:
     problem = Problem(title="Too short", status=422, code="too_few_frames", detail="Track more frames.")
     with opened(kind, {"url": "http://pliant.test", "transport": InMemoryService(problem=problem)}) as client:
         job = client.submit(moving_points(), options=FAST)

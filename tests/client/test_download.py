@@ -27,7 +27,7 @@ class Torn(httpx.SyncByteStream):
 
 
 class Tearing(InMemoryService):
-    """Sends files in pieces of a given size, then breaks off; or changes what it sends."""
+    """Breaks off each file after a given number of bytes, or corrupts it."""
 
     def __init__(self, piece: int) -> None:
         super().__init__()
@@ -117,7 +117,7 @@ def test_an_existing_file_is_not_downloaded_again(tmp_path: Path) -> None:
     assert len(service.fetches()) == before + 1
 
 
-def test_parts_of_different_files_are_never_mixed(tmp_path: Path) -> None:
+def test_corrupt_partial_downloads_are_replaced(tmp_path: Path) -> None:
     service = Tearing(10**9)
     client, job, data = finished_job(service)
     artifact = next(a for a in client.get(job).record.artifacts if a.name == "shapes.npz")

@@ -45,7 +45,7 @@ class Breaking(httpx.SyncByteStream):
 
 
 class Shaky(InMemoryService):
-    """Breaks every stream off after one event and a half."""
+    """Breaks off every stream after one and a half events."""
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         answer = super().handle_request(request)
@@ -86,7 +86,7 @@ def test_an_interrupted_stream_resumes_after_the_last_event() -> None:
 
 def test_progress_events_change_only_the_progress() -> None:
     class Late(InMemoryService):
-        """Keeps no event but the latest progress; the record has to be asked for."""
+        """Streams only the latest progress; the record has to be requested."""
 
         streams = 0
 
@@ -113,7 +113,7 @@ def test_progress_events_change_only_the_progress() -> None:
         ("text/event-stream", "event: job\ndata: {}\n\n", "cannot be read"),
     ],
 )
-def test_a_response_that_is_no_event_stream_is_an_error(kind: str, content: str, words: str) -> None:
+def test_an_invalid_event_stream_is_an_error(kind: str, content: str, words: str) -> None:
     class Odd(InMemoryService):
         def handle_request(self, request: httpx.Request) -> httpx.Response:
             if request.url.path.endswith("/events"):

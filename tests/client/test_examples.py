@@ -46,7 +46,7 @@ def test_from_cotracker(run, tmp_path: Path) -> None:
 
 
 def in_model(points: np.ndarray) -> np.ndarray:
-    """Points of a 640 × 480 picture in the 256 × 256 one that TAPNext and TAPIR see, from its corner."""
+    """Scale points of a 640 × 480 picture to the 256 × 256 input of TAPNext and TAPIR, measured from its corner."""
     return ((points + 0.5) * (256 / 640, 256 / 480)).astype(np.float32)
 
 

@@ -25,7 +25,7 @@ def test_every_exported_name_exists_and_every_error_is_exported() -> None:
         _ = pliant.client.Clinet
 
 
-def test_the_drawn_tree_of_errors_is_the_real_one() -> None:
+def test_the_documented_error_tree_matches_the_classes() -> None:
     drawn = [line for line in (errors.__doc__ or "").splitlines() if line.startswith("    ")]
     depth_of = {
         line.split()[0 if "─" not in line else line.split().index("├──" if "├──" in line else "└──") + 1]: line
@@ -66,14 +66,14 @@ def test_both_clients_have_the_same_methods_and_parameters(one: type, other: typ
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )  # fmt: skip
-def test_an_import_loads_no_more_than_it_needs(module: str, spared: set[str]) -> None:
+def test_imports_do_not_load_unneeded_packages(module: str, spared: set[str]) -> None:
     ran = subprocess.run(
         [sys.executable, "-c", f"import sys, {module}; print(*sys.modules)"], capture_output=True, text=True, check=True
     )
     assert set(ran.stdout.split()) & spared == set()
 
 
-def test_the_sdk_needs_httpx_numpy_and_pydantic_alone() -> None:
+def test_the_sdk_needs_only_httpx_numpy_and_pydantic() -> None:
     others = [
         "rich",
         "typer",

@@ -23,7 +23,7 @@ def test_the_committed_client_is_the_generated_one(tmp_path: Path) -> None:
     assert set(generated) == {path.name for path in SOURCE.glob("*.py")}
 
 
-def test_nothing_asynchronous_is_left_in_it() -> None:
+def test_the_generated_client_contains_no_async_code() -> None:
     for path in TARGET.glob("*.py"):
         lines = path.read_text().splitlines()
         assert lines[0] == f"# Generated from client/_async/{path.name} by `make client`. Edit that file instead."

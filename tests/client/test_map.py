@@ -22,7 +22,7 @@ def test_results_come_in_the_order_of_the_inputs() -> None:
     assert [result.shapes.shape for result in results] == [(5, 10 + seed, 3) for seed in range(4)]
 
 
-def test_no_more_are_ahead_than_may() -> None:
+def test_map_submits_at_most_at_once_jobs_ahead() -> None:
     with Client("http://pliant.test", transport=InMemoryService(steps=1)) as client:
         most = []
         for number, _ in enumerate(client.map(iter(inputs(5)), at_once=2, mesh="none", load=False)):
@@ -38,7 +38,7 @@ def test_the_asynchronous_client_maps_too() -> None:
     assert asyncio.run(run()) == [(5, 10, 3), (5, 11, 3)]
 
 
-def test_a_refused_input_ends_it_or_is_reported() -> None:
+def test_a_rejected_input_ends_the_map_or_is_reported() -> None:
     wrong = [*inputs(1), np.ones((2, 9, 2)), *inputs(1)]
     with Client("http://pliant.test", transport=InMemoryService(steps=1)) as client:
         with pytest.raises(InvalidRequest):
@@ -50,7 +50,7 @@ def test_a_refused_input_ends_it_or_is_reported() -> None:
     assert isinstance(failed[0][1], InvalidRequest)
 
 
-def test_the_same_key_finds_the_jobs_of_the_first_time() -> None:
+def test_the_same_key_returns_the_existing_jobs() -> None:
     with Client("http://pliant.test", transport=InMemoryService(steps=1)) as client:
         first = [result.job.id for result in client.map(inputs(3), key="tonight", mesh="none", load=False)]
         again = [result.job.id for result in client.map(inputs(3), key="tonight", mesh="none", load=False)]
@@ -58,7 +58,7 @@ def test_the_same_key_finds_the_jobs_of_the_first_time() -> None:
         assert len(list(client.list())) == 3
 
 
-def test_jobs_are_named_after_their_files_as_far_as_a_service_takes_it(tmp_path: Path) -> None:
+def test_jobs_are_named_after_their_files_up_to_the_length_limit(tmp_path: Path) -> None:
     files = [tmp_path / f"{name}.npz" for name in ("face", "x" * 230)]
     for file, tracks in zip(files, inputs(2), strict=True):
         np.savez(file, tracks=tracks)

@@ -9,7 +9,7 @@ from pliant.schemas.options import SOLVER_FIELDS, Options
 from pliant.solver import Settings
 
 
-def test_options_mirror_the_settings_name_for_name_and_default_for_default() -> None:
+def test_options_mirror_the_solver_settings_and_their_defaults() -> None:
     settings = {field.name: field.default for field in dataclasses.fields(Settings)}
     del settings["y_up"]  # comes from how the tracks were read
     options = {name: Options.model_fields[name].default for name in SOLVER_FIELDS}
@@ -21,12 +21,12 @@ def test_every_option_has_a_description() -> None:
 
 
 @pytest.mark.parametrize("given", ["usd, glb,usd", ["usd", "glb"], ("glb", "usd")])
-def test_outputs_are_a_list_or_words_between_commas(given: object) -> None:
+def test_outputs_are_a_list_or_comma_separated_names(given: object) -> None:
     assert Options(outputs=given).outputs == ("glb", "usd")
     assert Options.model_validate_json(Options(outputs=given).model_dump_json()).outputs == ("glb", "usd")
 
 
-def test_a_principal_point_is_two_numbers_with_a_comma_between() -> None:
+def test_a_principal_point_is_two_comma_separated_numbers() -> None:
     assert Options.model_validate({"principal_point": "320,240.5"}).principal_point == "320,240.5"
     with pytest.raises(ValueError, match="principal_point"):
         Options.model_validate({"principal_point": "320"})

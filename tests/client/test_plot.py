@@ -1,4 +1,4 @@
-"""Plots: a lit surface with a mesh, points without one or with too large a one."""
+"""Plots: a lit surface for a mesh, points without a mesh or if it is too large."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ SEQUENCE = flag(6, 60)
 SHAPES = SEQUENCE.shapes - SEQUENCE.shapes.mean(axis=1, keepdims=True)
 
 
-def test_a_quad_is_two_triangles_and_a_triangle_itself() -> None:
+def test_quads_are_split_into_triangles_and_triangles_are_kept() -> None:
     np.testing.assert_array_equal(plot.split(np.array([[0, 1, 2, 3]], np.int32)), [[0, 1, 2], [0, 2, 3]])
     np.testing.assert_array_equal(plot.split(np.array([[4, 5, 6]], np.int32)), [[4, 5, 6]])
     assert plot.split(np.zeros((0, 3), np.int32)).shape == (0, 3)
 
 
-def test_a_mesh_is_drawn_as_a_surface_upright_and_lit() -> None:
+def test_a_mesh_is_drawn_as_a_lit_surface() -> None:
     faces = SEQUENCE.mesh.faces
     figure = plot.draw(SHAPES, faces, 3, title="flag")
     assert [axes.get_title() for axes in figure.axes] == ["frame 0", "frame 2", "frame 5"]
@@ -34,7 +34,7 @@ def test_a_mesh_is_drawn_as_a_surface_upright_and_lit() -> None:
 
 
 @pytest.mark.parametrize("most", [0, None])
-def test_points_are_drawn_where_there_is_no_surface(monkeypatch: pytest.MonkeyPatch, most: int | None) -> None:
+def test_points_are_drawn_if_a_mesh_is_missing_or_too_large(monkeypatch: pytest.MonkeyPatch, most: int | None) -> None:
     faces = SEQUENCE.mesh.faces if most is not None else np.zeros((0, 3), np.int32)
     if most is not None:
         monkeypatch.setattr(plot, "MOST_TRIANGLES", most)

@@ -18,7 +18,7 @@ POINTS = np.random.default_rng(1).normal(size=(4, 9, 2))
 
 
 class Bars:
-    """Stands for rich's: remembers what was shown."""
+    """Stand-in for rich's progress bars that records the updates."""
 
     def __init__(self) -> None:
         self.shown: list[tuple[str, float]] = []
@@ -30,7 +30,7 @@ class Bars:
         self.shown.append((str(description), completed))
 
 
-def test_the_bar_takes_every_callback_of_the_sdk() -> None:
+def test_the_bar_handles_every_callback_of_the_sdk() -> None:
     bars = Bars()
     bar = Bar(bars)
     with Client("http://pliant.test", transport=InMemoryService(steps=3), retries=Retry(poll_interval=0.01)) as client:
@@ -50,7 +50,7 @@ def test_the_bar_takes_every_callback_of_the_sdk() -> None:
     assert all(0 <= fraction <= 1 for _, fraction in bars.shown)
 
 
-def test_a_terminal_sees_it_and_a_file_does_not() -> None:
+def test_progress_is_shown_on_terminals_only() -> None:
     for terminal in (True, False):
         screen = io.StringIO()
         with progress_bar(Console(file=screen, force_terminal=terminal)) as bar:

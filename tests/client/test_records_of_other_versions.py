@@ -9,7 +9,7 @@ from pliant.schemas.options import Options
 from pydantic import ValidationError
 
 
-def test_a_job_of_a_newer_service_is_read() -> None:
+def test_jobs_with_unknown_fields_of_a_newer_service_are_accepted() -> None:
     interpretation = Interpretation(
         num_frames=3, num_points=4, num_faces=0, hidden_fraction=0, mesh_source="none", has_ground_truth=False,
         has_rotations=False, layout="",

@@ -31,14 +31,14 @@ class Installation:
         self.port = int(self.url.rpartition(":")[2])
 
     def start(self) -> str:
-        """Start it, again and again as a service manager does: the children of a killed one may hold the port for a moment."""
+        """Start it, retrying as a service manager does: children of a killed process may hold the port for a moment."""
         command = [sys.executable, "-m", "pliant.cli", "up", "--json", "--port", str(self.port)]
         deadline = time.monotonic() + 60
         while time.monotonic() < deadline:
             with (self.folder / "log").open("ab") as log:
                 self.process = subprocess.Popen(
                     [*command, "--data", str(self.folder / "data")],
-                    env={**os.environ, "PLIANT_STOP_GRACE": "0"},  # nothing is finished after everything was killed
+                    env={**os.environ, "PLIANT_STOP_GRACE": "0"},  # no job finishes after everything was killed
                     stdout=subprocess.PIPE, stderr=log, text=True,
                 )  # fmt: skip
             assert self.process.stdout is not None
@@ -65,7 +65,7 @@ class Installation:
         self.process.stdout.close()
 
     def service_pid(self) -> int:
-        """The API process, which the supervisor starts again by itself."""
+        """Return the API process, which the supervisor restarts."""
         assert self.process is not None
         for entry in Path("/proc").iterdir():
             if not entry.name.isdigit():
@@ -89,7 +89,7 @@ def installation(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Installat
 
 @pytest.fixture
 def killing(installation: Installation) -> Iterator[Callable[[str], None]]:
-    """Kill `everything`, and start it again as a service manager would; or the `service` alone, which its supervisor starts again."""
+    """Kill `everything` and restart it as a service manager would, or only the `service`, which its supervisor restarts."""
     restarts: list[threading.Thread] = []
 
     def kill(what: str) -> None:
@@ -129,7 +129,7 @@ def test_the_client_survives_a_killed_service_while_waiting_and_downloading(
         assert (result.job.attempt > 1) == (what == "everything")
 
         size = next(artifact.bytes for artifact in result.job.artifacts if artifact.name == "shapes.npz")
-        assert size > 10_000_000  # more than the sockets' buffers hold, so that the connection breaks in mid file
+        assert size > 10_000_000  # more than the sockets' buffers hold, so that the connection breaks mid-file
         killed: list[int] = []
 
         def kill_in_mid_download(done: int, total: int) -> None:

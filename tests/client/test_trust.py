@@ -12,7 +12,7 @@ from pliant.schemas.job import Interpretation, Job, Status
 from pliant.schemas.options import Options
 
 
-def test_deviations_and_verdict_come_from_the_files_and_the_record(tmp_path: Path) -> None:
+def test_results_read_uncertainty_and_camera_from_files_verdict_from_the_job(tmp_path: Path) -> None:
     interpretation = Interpretation(
         num_frames=2, num_points=3, num_faces=0, hidden_fraction=0, mesh_source="none", has_ground_truth=False,
         has_rotations=False, layout="",

@@ -1,4 +1,4 @@
-"""Words for values that pydantic rejects."""
+"""Messages for values that pydantic rejects."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Named(BaseModel):
         (Named, {}, "a value"),
     ],
 )
-def test_words_continue_expected(model: type[BaseModel], given: dict[str, object], words: str) -> None:
+def test_pydantic_errors_become_expectations(model: type[BaseModel], given: dict[str, object], words: str) -> None:
     with pytest.raises(ValidationError) as caught:
         model.model_validate(given)
     assert expectation(caught.value.errors()[0]) == words

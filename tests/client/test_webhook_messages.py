@@ -88,7 +88,7 @@ async def _submitted(service: InMemoryService, **given: str) -> None:
         await client.submit(100 * np.random.default_rng(0).random((4, 5, 2)), **given)
 
 
-def test_both_clients_send_the_parts() -> None:
+def test_both_clients_send_the_webhook_parts() -> None:
     import asyncio
 
     given = {"webhook": "https://receiver.example/x", "webhook_secret": SECRET}

@@ -49,7 +49,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
             up.wait(30)
 
 
-@pytest.fixture(scope="module")  # not longer: while Playwright is there, no other test may run an event loop
+@pytest.fixture(scope="module")  # not longer: while Playwright runs, no other test may run an event loop
 def browser() -> Iterator[Browser]:
     with Browsing() as browsing:
         yield browsing
@@ -57,7 +57,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def page(browser: Browser, url: str) -> Iterator[Page]:
-    """An empty page of its own; a script error or a blocked request fails the test."""
+    """A blank page in a new context; script errors and blocked requests fail the test."""
     context = browser.new_context(viewport={"width": 1280, "height": 900}, reduced_motion="reduce")
     context.add_init_script(
         "addEventListener('securitypolicyviolation', (event) => console.error('CSP blocked ' + event.blockedURI));"
@@ -67,22 +67,22 @@ def page(browser: Browser, url: str) -> Iterator[Page]:
     page.on("pageerror", lambda error: troubles.append(str(error)))
     page.on("console", lambda message: troubles.append(message.text) if "CSP" in message.text else None)
     yield page
-    page.unroute_all(behavior="ignoreErrors")  # a request may be under way when the test ends
+    page.unroute_all(behavior="ignoreErrors")  # a request may be in flight when the test ends
     context.close()
     for job in httpx.get(f"{url}/v1/jobs?status=queued&status=running&limit=100").json()["jobs"]:
-        httpx.post(f"{url}/v1/jobs/{job['id']}/cancel")  # the next test wants the one worker
+        httpx.post(f"{url}/v1/jobs/{job['id']}/cancel")  # the next test needs the only worker
     assert troubles == []
 
 
 @pytest.fixture
 def front(page: Page, url: str) -> None:
-    """Open the front page; a test that shows something else goes there at once, and the browser draws one page less."""
+    """Open the front page; tests that show another page do without, which saves drawing one."""
     page.goto(url)
 
 
 @pytest.fixture(scope="session")
 def small() -> dict[str, bytes]:
-    """A flag of a few hundred points, which moves as a whole: a result within seconds."""
+    """A flag of a few hundred points, all of them moving, that is solved within seconds."""
     sequence = corrupt(flag(10, 300), outliers=0.02)
     return {
         TRACKS: packed(tracks=sequence.tracks.points, visibility=sequence.tracks.visible > 0),
@@ -93,7 +93,7 @@ def small() -> dict[str, bytes]:
 
 @pytest.fixture
 def long_job(url: str) -> Iterator[Callable[[str], str]]:
-    """Queue a job that only ever ends from outside; it is cancelled after the test."""
+    """Submit a job that runs until it is cancelled, at the latest after the test."""
     queued: list[str] = []
 
     def submit(name: str) -> str:

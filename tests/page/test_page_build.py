@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def builder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """build_page.py, working on a copy of the sources in a folder of its own."""
+    """build_page.py, working on a copy of the sources in a temporary folder."""
     spec = importlib.util.spec_from_file_location("build_page", ROOT / "build_page.py")
     assert spec is not None
     assert spec.loader is not None
@@ -56,7 +56,7 @@ def test_a_required_page_that_cannot_be_built_stops_the_build(
         builder.provide_page()
 
 
-def test_a_registry_that_does_not_answer_is_reported(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreachable_npm_registry_is_reported(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     use_commands(builder, monkeypatch, "", "import sys; sys.exit('ETIMEDOUT')")
     with pytest.raises(builder.PageNotBuilt, match=r"connection to the npm registry.*exit code 1: ETIMEDOUT"):
         builder.build_page()
@@ -72,7 +72,7 @@ def test_a_failing_bundler_is_reported(builder: ModuleType, monkeypatch: pytest.
         builder.build_page()
 
 
-def test_a_page_newer_than_its_sources_is_left_alone(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_up_to_date_page_is_not_rebuilt(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(builder, "node_commands", lambda: pytest.fail("asked for Node.js"))
     builder.BUILT.parent.mkdir()
     builder.BUILT.write_text("<!doctype html>")
@@ -81,7 +81,7 @@ def test_a_page_newer_than_its_sources_is_left_alone(builder: ModuleType, monkey
     builder.provide_page()
 
 
-def test_skip_does_not_try(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_skip_does_not_build_the_page(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(builder, "node_commands", lambda: pytest.fail("asked for Node.js"))
     monkeypatch.setenv("PLIANT_PAGE", "skip")
     builder.provide_page()
@@ -89,7 +89,7 @@ def test_skip_does_not_try(builder: ModuleType, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.node
-def test_the_pages_types_hold(builder: ModuleType) -> None:
+def test_the_page_passes_the_type_check(builder: ModuleType) -> None:
     checker = ROOT / "service" / "web" / "node_modules" / "typescript" / "bin" / "tsc"
     if not checker.is_file() and not os.environ.get("CI"):
         pytest.skip("TypeScript is not installed; say `make page`")
@@ -101,7 +101,7 @@ def test_the_pages_types_hold(builder: ModuleType) -> None:
 
 
 @pytest.mark.node
-def test_the_types_of_the_api_are_generated_from_its_document(builder: ModuleType, tmp_path: Path) -> None:
+def test_the_api_types_match_the_openapi_document(builder: ModuleType, tmp_path: Path) -> None:
     generator = ROOT / "service" / "web" / "node_modules" / "openapi-typescript" / "bin" / "cli.js"
     if not generator.is_file() and not os.environ.get("CI"):
         pytest.skip("openapi-typescript is not installed; run `make page`")

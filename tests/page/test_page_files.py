@@ -1,4 +1,4 @@
-"""How the built page is served: what may be cached, what a browser asks for again, and the answer where there is no page."""
+"""How the built page is served: caching, revalidation, and the response while there is no page."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_the_page_is_revalidated_and_its_files_are_immutable(built: TestClient) 
     assert script.headers["content-type"].startswith("text/javascript")
 
 
-def test_the_policy_allows_this_host_alone(built: TestClient) -> None:
+def test_the_content_security_policy_allows_only_this_host(built: TestClient) -> None:
     policy = built.get("/").headers["content-security-policy"]
     assert policy.startswith("default-src 'self';")
     assert "unsafe" not in policy
@@ -56,7 +56,7 @@ def test_an_unchanged_file_is_not_sent_twice(built: TestClient, encoding: str) -
         assert again.headers[name] == first.headers[name], "a browser takes over the headers of a 304"
 
 
-def test_the_packed_and_the_plain_file_have_different_validators(built: TestClient) -> None:
+def test_compressed_and_plain_responses_have_different_etags(built: TestClient) -> None:
     plain, packed = (built.get("/", headers={"Accept-Encoding": name}) for name in ("identity", "gzip"))
     assert plain.text == packed.text
     assert plain.headers["etag"] != packed.headers["etag"]
@@ -76,7 +76,7 @@ def test_head_returns_the_same_headers_without_a_body(built: TestClient) -> None
 
 
 @pytest.mark.parametrize("address", ["/", "/docs", "/guide"])
-def test_without_a_built_page_a_sentence_says_how_to_build_it(tmp_path: Path, address: str) -> None:
+def test_a_missing_page_returns_503_with_build_instructions(tmp_path: Path, address: str) -> None:
     app = FastAPI(docs_url=None)
     mount_page(app, tmp_path / "absent")
     answer = TestClient(app).get(address)
@@ -94,5 +94,5 @@ def test_a_page_built_later_is_served_without_a_restart(tmp_path: Path) -> None:
     assert client.get("/").text == "<!doctype html><title>Pliant</title>"
 
 
-def test_the_page_stays_out_of_the_api_description(built: TestClient) -> None:
+def test_the_page_is_not_in_the_openapi_document(built: TestClient) -> None:
     assert built.get("/openapi.json").json()["paths"] == {}

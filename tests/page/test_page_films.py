@@ -64,7 +64,7 @@ def films(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 @pytest.fixture
 def filming(page: Page, url: str, finished: str) -> Page:
-    """The front page of a service that tracks films; jobs are answered with a record instead of being made."""
+    """The front page of a service that tracks films; its answers are prepared, and no job is created."""
     page.add_init_script(f"({KEEP_SENT})()")
     page.route("**/v1/options", with_film_options)
     page.route("**/v1/inspect", lambda route: route.fulfill(json=film_record(url, finished)["interpretation"]))
@@ -74,13 +74,13 @@ def filming(page: Page, url: str, finished: str) -> Page:
 
 
 def with_film_options(route: Route) -> None:
-    schema = httpx.get(route.request.url).json()  # not `route.fetch`, whose answer is gone where the page has moved on
+    schema = httpx.get(route.request.url).json()  # not `route.fetch`, which fails once the page has navigated away
     schema["properties"].setdefault("region_polygon", {"type": "array", "default": None, "description": "Drawn."})
     route.fulfill(json=schema)
 
 
 def film_record(url: str, finished: str, **fields: Any) -> dict[str, Any]:
-    """Return the record of a film's job that runs, made of the record of a job that ended."""
+    """Return the record of a running film job, derived from that of a finished job."""
     record = httpx.get(f"{url}/v1/jobs/{finished}").json()
     read = {"num_frames": 6, "num_points": 0, "num_faces": 0, "mesh_source": "film", "format": "film (webm)"}
     notes = ["A film of 320×240 pixels, 6 frames, 5 frames per second. Its points are tracked when the job runs."]
@@ -105,7 +105,7 @@ def answer_with(page: Page, record: dict[str, Any]) -> None:
 
 
 def drag(page: Page, *places: tuple[float, float]) -> None:
-    """Draw along places given as shares of the picture's width and height."""
+    """Drag through points given as fractions of the picture's width and height."""
     box = page.get_by_role("application").bounding_box()
     assert box is not None
     at = [(box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in places]
@@ -127,7 +127,7 @@ def sent_options(page: Page) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", ["film.webm", "pictures.zip"])
-def test_a_dropped_film_shows_its_first_frame_in_place_of_tracks(
+def test_a_dropped_film_shows_its_first_frame_and_hides_other_inputs(
     filming: Page, films: dict[str, bytes], name: str
 ) -> None:
     drop(filming, {name: films[name]})
@@ -136,7 +136,7 @@ def test_a_dropped_film_shows_its_first_frame_in_place_of_tracks(
     red, green, blue = colour_at_corner(filming)
     assert red > 150
     assert max(green, blue) < 90
-    expect(filming.get_by_text("turn by 30° or more, keep it sharp, and keep the object large")).to_be_visible()
+    expect(filming.get_by_text("turn the object by 30° or more, and keep it sharp and large")).to_be_visible()
     expect(filming.get_by_text("No region: the whole picture is tracked.")).to_be_visible()
     expect(filming.get_by_role("region", name="How your files are interpreted")).to_contain_text("6 frames")
     for part in ("tracks", "mesh", "ground_truth", "rotations"):
@@ -154,7 +154,7 @@ def test_a_region_drawn_with_the_mouse_is_sent_with_the_film(
     filming.get_by_role("button", name="Draw a region").click()
     status = filming.get_by_role("dialog").get_by_role("status")
     drag(filming, (0.5, 0.5), (0.501, 0.501))
-    expect(status).to_have_text("That region is too small. Drag to draw it.")
+    expect(status).to_have_text("The region is too small. Drag to draw a larger one.")
     drag(filming, (0.2, 0.2), (0.8, 0.2), (0.8, 0.8), (0.2, 0.8))
     expect(status).to_contain_text("Lasso with")
     filming.get_by_role("button", name="Rectangle").click()
@@ -203,14 +203,14 @@ def test_a_region_is_drawn_with_the_keyboard_only(
     expect(filming.get_by_role("dialog")).to_have_count(0)
     filming.get_by_role("button", name="Change the region").press("Enter")
     keys.press("ArrowDown")
-    keys.press("Escape")  # leaves the region as it was
+    keys.press("Escape")  # discards the change
     expect(filming.get_by_role("dialog")).to_have_count(0)
     filming.get_by_role("button", name="Reconstruct").press("Enter")
     expect(filming.get_by_text("Tracking the film")).to_be_visible()
     assert sent_options(filming)["region_polygon"] == [[0, 57], [160, 57], [160, 180], [0, 180]]
 
 
-def test_a_region_drawn_with_a_finger(filming: Page, films: dict[str, bytes]) -> None:
+def test_a_region_can_be_drawn_by_touch(filming: Page, films: dict[str, bytes]) -> None:
     filming.set_viewport_size({"width": 390, "height": 844})
     drop(filming, {"film.webm": films["film.webm"]})
     filming.get_by_role("button", name="Draw a region").click()
@@ -236,7 +236,7 @@ def test_a_film_that_the_browser_cannot_show_is_sent_without_a_region(
 ) -> None:
     answer_with(filming, film_record(url, finished))
     drop(filming, {"old.mp4": films["old.mp4"]})
-    expect(filming.get_by_text("This browser cannot show the film")).to_be_visible()
+    expect(filming.get_by_text("This browser cannot decode the film")).to_be_visible()
     expect(filming.get_by_role("button", name="Draw a region")).to_be_hidden()
     expect(filming.get_by_text("How your files are interpreted")).to_be_visible()
     filming.get_by_role("button", name="Reconstruct").click()
@@ -246,10 +246,10 @@ def test_a_film_that_the_browser_cannot_show_is_sent_without_a_region(
 
 
 @pytest.mark.parametrize("name", ["old.mp4", "film.webm"])
-def test_a_region_is_drawn_on_the_first_frame_that_the_service_decoded(
+def test_the_services_first_frame_is_used_if_the_browser_cannot_decode(
     filming: Page, url: str, films: dict[str, bytes], finished: str, name: str
 ) -> None:
-    """Unless the browser decodes it, whichever of the two is first; corners are in the film's pixels."""
+    """The browser's own frame takes precedence, whichever arrives first; corners are in the film's pixels."""
     small = bytes(cv2.imencode(".jpg", np.full((HEIGHT // 2, WIDTH // 2, 3), BLUE, np.uint8))[1])
     seen = {
         **film_record(url, finished)["interpretation"],
@@ -291,7 +291,7 @@ def test_a_service_without_films_offers_no_film_input(page: Page, url: str) -> N
 def test_the_camera_records_a_film(filming: Page) -> None:
     filming.get_by_role("button", name="Record with the camera").click()
     dialog = filming.get_by_role("dialog", name="Record a film")
-    expect(dialog).to_contain_text("At most 20 seconds are recorded.")
+    expect(dialog).to_contain_text("Recording stops after 20 seconds.")
     dialog.get_by_role("button", name="Record").click()
     expect(dialog).to_contain_text("19 s left")
     dialog.get_by_role("button", name="Stop").click()
@@ -301,7 +301,7 @@ def test_the_camera_records_a_film(filming: Page) -> None:
     expect(filming.get_by_role("button", name="Draw a region")).to_be_visible()
 
 
-def test_a_running_films_picture_points_title_and_clock(
+def test_a_running_film_job_shows_frame_points_progress_and_time_left(
     filming: Page, url: str, films: dict[str, bytes], finished: str
 ) -> None:
     record = film_record(url, finished)
@@ -309,7 +309,7 @@ def test_a_running_films_picture_points_title_and_clock(
     filming.get_by_role("img", name="First frame of the film").wait_for()
     answer_with(filming, record)
     filming.get_by_role("button", name="Reconstruct").click()
-    live = filming.get_by_role("img", name="The film with the points that are tracked")
+    live = filming.get_by_role("img", name="The film with its tracked points")
 
     def reddest() -> list[int]:
         """A pixel of the picture's corner: the first frame is red, the others are blue."""
@@ -318,9 +318,9 @@ def test_a_running_films_picture_points_title_and_clock(
 
     until(lambda: reddest()[0] > 150 > reddest()[2])  # before any point is known
     assert filming.title() == "20\u00a0% – a film – Pliant"
-    left = filming.locator(".figures div", has_text="Left").locator("dd")
+    left = filming.locator(".figures div", has_text="Time left").locator("dd")
     first = left.inner_text()
-    until(lambda: left.inner_text() != first)  # no message came: the page counts by itself
+    until(lambda: left.inner_text() != first)  # no message arrived: the page counts by itself
     followed = {"frame": 3, "seconds": 0.6, "width": WIDTH, "height": HEIGHT, "points": [160, 120, 170, 130]}
     moved = {**record["progress"], "followed": followed, "fraction": 0.3, "updated_at": "2099-01-01T00:00:00Z"}
     answer_with(filming, {**record, "progress": moved})
@@ -341,11 +341,11 @@ NOTE = """() => {
 }"""
 
 
-def test_a_notification_at_the_end_for_those_who_asked(filming: Page, url: str, finished: str) -> None:
+def test_users_who_opted_in_are_notified_when_the_job_ends(filming: Page, url: str, finished: str) -> None:
     filming.add_init_script(f"({NOTE})()")
     record = film_record(url, finished)
     answer_with(filming, record)
-    filming.goto("about:blank")  # the script runs in documents that come after it
+    filming.goto("about:blank")  # init scripts run only in documents that are loaded afterwards
     filming.goto(f"{url}/#job={finished}")
     filming.get_by_role("button", name="Notify me at the end").click()
     expect(filming.get_by_role("button", name="You will be notified")).to_be_disabled()

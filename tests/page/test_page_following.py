@@ -32,7 +32,7 @@ def test_a_running_job_survives_a_reload_and_can_be_cancelled(
     objective.wait_for(timeout=DONE)
     until(lambda: steps_of(objective) >= 4)
     page.reload()
-    # The events of before the reload are sent again: the curve is whole.
+    # Events from before the reload are sent again, so the curve is complete.
     objective.wait_for()
     until(lambda: steps_of(objective) >= 4)
     expect(page.get_by_text(re.compile(r"reweighting \d+[;.]"))).to_be_visible()
@@ -64,7 +64,7 @@ def test_the_list_follows_a_running_job_that_is_not_shown(page: Page, url: str, 
         beside = client.submit(tracks, name="a job beside it").id
     row = page.get_by_role("link", name="a job beside it")
     expect(row).to_contain_text(re.compile(r"Running, \d+"), timeout=DONE)
-    # With the list itself kept away, it is the events that move the bar.
+    # With requests for the list blocked, only events can move the bar.
     page.route(re.compile(r"/v1/jobs\?"), lambda route: route.abort())
     before = float(row.get_by_role("progressbar", include_hidden=True).get_attribute("value") or 0)
     until(lambda: float(row.get_by_role("progressbar", include_hidden=True).evaluate("(it) => it.value")) > before)
@@ -91,7 +91,7 @@ def test_a_token_is_requested_once_and_sent_with_every_request(page: Page, url: 
     page.route("**/v1/**", guarded)
     page.goto(f"{url}/#job={finished}")
     expect(page.get_by_role("alert").first).to_contain_text("This service needs a token")
-    expect(page.get_by_role("alert").first).to_contain_text("Paste the one that you were given for this service.")
+    expect(page.get_by_role("alert").first).to_contain_text("Paste the token you were given;")
     page.get_by_label("Token").fill("a-token")
     page.get_by_role("button", name="Use", exact=True).click()
     page.locator(".view canvas").wait_for(timeout=30_000)

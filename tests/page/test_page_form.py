@@ -1,4 +1,4 @@
-"""The form in use: where its button is, options by intent, refusals in place; and what a finished job leads to."""
+"""The form: its button, grouped options and inline errors; exporting, sharing and rerunning a finished job."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SOON = 60_000
 
 
 def axe_findings(page: Page) -> list[str]:
-    """What axe-core finds; its script is put into an isolated world, where the page's policy does not hold."""
+    """Return axe-core's violations; it runs in an isolated world, which the content security policy does not restrict."""
     session = page.context.new_cdp_session(page)
     world = session.send(
         "Page.createIsolatedWorld", {"frameId": session.send("Page.getFrameTree")["frameTree"]["frame"]["id"]}
@@ -41,7 +41,7 @@ def axe_findings(page: Page) -> list[str]:
 
 
 def zipped(name: str) -> bytes:
-    """An archive with one member of this name."""
+    """Return a zip archive with one member of this name."""
     into = io.BytesIO()
     with zipfile.ZipFile(into, "w") as archive:
         archive.writestr(name, b"")
@@ -49,7 +49,7 @@ def zipped(name: str) -> bytes:
 
 
 def small_targets(page: Page) -> list[str]:
-    """Controls that are seen and smaller than 24 px in a direction; links within a sentence are exempt."""
+    """Return visible controls smaller than 24 px in either direction; links within a sentence are exempt."""
     script = """() => [...document.querySelectorAll('button, select, input, summary, a')].filter((it) => {
       const box = it.getBoundingClientRect();
       if (box.width === 0 || it.closest('p, td, li, dd, .visually-hidden') || getComputedStyle(it).opacity === '0') return false;
@@ -60,7 +60,7 @@ def small_targets(page: Page) -> list[str]:
 
 
 @pytest.mark.usefixtures("front")
-def test_button_folds_and_refusals_in_place(page: Page) -> None:
+def test_the_form_shows_input_errors_inline_and_keeps_the_button_visible(page: Page) -> None:
     page.set_viewport_size({"width": 1280, "height": 720})
     send = page.get_by_role("button", name="Reconstruct")
     expect(send).to_be_in_viewport()
@@ -75,7 +75,7 @@ def test_button_folds_and_refusals_in_place(page: Page) -> None:
     expect(alert.get_by_role("paragraph")).to_have_text(
         [
             "Expected members named like tracks.npy, got '../tracks.npy'.",
-            "Give the arrays in the file plain names without folders, such as tracks and visibility, and save it again.",
+            "Save the file again with plain array names without folders, such as tracks and visibility.",
             "What files can I send?About this errormember_name",
         ]
     )
@@ -90,7 +90,7 @@ def test_button_folds_and_refusals_in_place(page: Page) -> None:
 
 
 @pytest.mark.usefixtures("front")
-def test_a_film_chosen_for_tracks_goes_to_its_own_place(page: Page) -> None:
+def test_a_film_chosen_as_tracks_moves_to_the_film_input(page: Page) -> None:
     page.locator("[data-part=film]").wait_for()
     film = {"name": "clip.mp4", "mimeType": "video/mp4", "buffer": b"\0\0\0\x18ftypmp42" + bytes(64)}
     page.get_by_label("Tracks", exact=True).set_input_files(film)  # type: ignore[arg-type]
@@ -99,14 +99,14 @@ def test_a_film_chosen_for_tracks_goes_to_its_own_place(page: Page) -> None:
     expect(page.locator("[data-part=film]").get_by_role("alert")).to_be_visible(timeout=SOON)
 
 
-def test_after_a_job_more_files_a_link_and_other_options(page: Page, url: str, finished: str) -> None:
+def test_a_finished_job_can_be_exported_shared_and_rerun(page: Page, url: str, finished: str) -> None:
     page.goto(f"{url}/#job={finished}")
     page.get_by_role("button", name="More files").click()
-    page.get_by_role("button", name="Make the files").click()
+    page.get_by_role("button", name="Create the files").click()
     expect(page.get_by_text("Choose at least one file.")).to_be_visible()
     page.get_by_label("MDD point cache").check()
     page.get_by_label("Frames per second").fill("50")
-    page.get_by_role("button", name="Make the files").click()
+    page.get_by_role("button", name="Create the files").click()
     with page.expect_download(timeout=SOON) as download:
         page.get_by_role("link", name="Save shapes.mdd").click(timeout=SOON)
     assert Path(download.value.path()).read_bytes()[:8] == b"\0\0\0\x0a\0\0\x01\x2c"
@@ -118,25 +118,25 @@ def test_after_a_job_more_files_a_link_and_other_options(page: Page, url: str, f
     assert link.startswith(f"{url}/#share=share.{finished}.")
     guest = page.context.new_page()
     guest.goto(link)
-    expect(guest.get_by_text("You see a shared result, read-only.")).to_be_visible()
+    expect(guest.get_by_text("This is a shared, read-only result.")).to_be_visible()
     expect(guest.get_by_role("heading", name="a finished face")).to_be_visible()
     expect(guest.get_by_role("button", name="Delete")).to_be_hidden()
     expect(guest.get_by_role("button", name="Reconstruct")).to_be_hidden()
     expect(guest.locator(".view canvas").first).to_be_visible(timeout=SOON)
     assert axe_findings(guest) == []
-    newest = httpx.get(f"{url}/v1/jobs/{finished}/shares").json()[-1]["id"]  # other links may be valid, too
+    newest = httpx.get(f"{url}/v1/jobs/{finished}/shares").json()[-1]["id"]  # other links may exist
     of_the_link = page.get_by_role("listitem").filter(has_text=f"Link {newest},")
     of_the_link.get_by_role("button", name="Revoke").click()
     expect(of_the_link).to_have_count(0)
     guest.reload()
-    expect(guest.get_by_role("heading", name="This result can no longer be seen")).to_be_visible()
+    expect(guest.get_by_role("heading", name="This result is no longer available")).to_be_visible()
     expect(guest.get_by_text("This share link is not valid: it was revoked")).to_be_visible()
     expect(guest.get_by_role("alert")).to_have_count(0)
     guest.close()
 
     page.get_by_role("button", name="Run again with other options").click()
-    expect(page.get_by_text("The inputs of “a finished face” are used again.")).to_be_visible()
-    page.get_by_text("For experts").click()
+    expect(page.get_by_text("This job reuses the inputs of “a finished face”.")).to_be_visible()
+    page.get_by_text("Advanced").click()
     page.get_by_label("Method").select_option(label="temporal")
     page.get_by_label("Name (optional)").fill("again")
     page.get_by_role("button", name="Reconstruct").click()
@@ -148,7 +148,7 @@ def test_after_a_job_more_files_a_link_and_other_options(page: Page, url: str, f
 
 
 @pytest.mark.usefixtures("front")
-def test_a_deleted_job_and_a_wrong_option(page: Page, url: str, small: dict[str, bytes]) -> None:
+def test_invalid_options_and_missing_jobs_show_their_errors(page: Page, url: str, small: dict[str, bytes]) -> None:
     choose(page, {TRACKS: small[TRACKS]})
     page.get_by_text("Camera", exact=True).click()
     page.get_by_label("Picture size").fill("wide")
@@ -157,11 +157,11 @@ def test_a_deleted_job_and_a_wrong_option(page: Page, url: str, small: dict[str,
     expect(place.get_by_role("alert").get_by_role("paragraph")).to_have_text(
         [
             "Expected width and height in pixels, such as 1920x1080, got 'wide'.",
-            "Change the value, or clear the field for the default.",
+            "Change the value, or clear the field to use the default.",
             "About this errorinvalid_option",
         ]
     )
-    expect(page.get_by_text("Not sent: see “Picture size” above.")).to_be_visible()
+    expect(page.get_by_text("Not submitted: see “Picture size” above.")).to_be_visible()
     page.goto(f"{url}/#job=0123456789abcdef")
     expect(page.get_by_role("heading", name="This job does not exist")).to_be_visible()
     expect(page.get_by_role("alert")).to_contain_text("There is no job '0123456789abcdef'.")

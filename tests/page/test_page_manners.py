@@ -26,7 +26,7 @@ def test_an_example_is_run_with_the_keyboard_only(page: Page) -> None:
                 return
         pytest.fail(f"the Tab key does not reach {name!r}")
 
-    page.get_by_role("button", name="breathing sphere").wait_for()  # the examples come with an answer of the service
+    page.get_by_role("button", name="breathing sphere").wait_for()  # the examples are loaded from the service
     tab_to("breathing sphere")
     page.keyboard.press("Enter")
     expect(page.get_by_role("button", name="Reconstruct")).to_be_focused()

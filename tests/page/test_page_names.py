@@ -31,7 +31,7 @@ pytestmark = [
 
 POINT_NAMES = tuple(f"Lid {number} ü" for number in range(21 * 31))
 GREYS = (20, 50, 80, 110, 140, 170, 200)
-"""Of the pictures of the film, frame by frame."""
+"""Grey level of each film frame."""
 AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 QUICK_LOOK = """const supports = DOMTokenList.prototype.supports;
 DOMTokenList.prototype.supports = function (word) { return word === "ar" || supports.call(this, word); };"""
@@ -66,7 +66,7 @@ def visitor(browser: Browser, **more: str) -> Page:
     return context.new_page()
 
 
-def test_a_local_result_has_its_own_names(browser: Browser, viewed: str) -> None:
+def test_a_local_result_shows_its_object_and_point_names(browser: Browser, viewed: str) -> None:
     page = visitor(browser)
     page.goto(viewed)
     expect(page.get_by_role("heading", name="Take 3/Büro")).to_be_visible()
@@ -78,7 +78,7 @@ def test_a_local_result_has_its_own_names(browser: Browser, viewed: str) -> None
         expect(page.locator(".probe dd").first).to_have_text(POINT_NAMES[point])
     number.fill("")
     canvas = page.get_by_role("application", name=re.compile("^3-D view"))
-    canvas.press("Enter")  # the point in the middle, as a click there
+    canvas.press("Enter")  # selects the point in the middle, like a click there
     expect(page.locator(".probe dd").first).to_have_text(re.compile(r"^Lid \d+ ü$"))
     expect(page.get_by_text("Use from code")).to_be_hidden()  # there is no service to use
     expect(page.get_by_label("Compare with")).to_have_count(0)
@@ -88,13 +88,13 @@ def test_a_local_result_has_its_own_names(browser: Browser, viewed: str) -> None
     page.context.close()
 
 
-def test_ar_is_offered_where_it_plays(browser: Browser, viewed: str) -> None:
+def test_ar_is_offered_where_quick_look_is_supported(browser: Browser, viewed: str) -> None:
     page = visitor(browser)
     page.add_init_script(QUICK_LOOK)
     page.goto(viewed)
     link = page.get_by_role("link", name="View in AR (USDZ)")
     expect(link).to_be_visible(timeout=DONE)
-    # What Safari asks for: the relation, a picture as the only child, and no download.
+    # Safari requires rel="ar", an image as the only child, and no download attribute.
     assert link.evaluate("(it) => [it.rel, it.children.length, it.firstChild.tagName, it.hasAttribute('download')]") == [
         "ar", 1, "IMG", False,
     ]  # fmt: skip
@@ -102,7 +102,7 @@ def test_ar_is_offered_where_it_plays(browser: Browser, viewed: str) -> None:
     page.context.close()
 
 
-def test_the_film_stands_beside_the_mesh_in_step(browser: Browser, viewed: str) -> None:
+def test_the_film_plays_in_step_beside_the_mesh(browser: Browser, viewed: str) -> None:
     page = visitor(browser)
     page.goto(viewed)
     film = page.get_by_role("img", name="The film at the same moment, with its tracks")
@@ -140,7 +140,7 @@ def share(url: str, job: str, **body: int) -> tuple[str, datetime]:
 @pytest.mark.parametrize(
     ("locale", "words"), [("en-GB", "%-d %B %Y at 15:00"), ("de-DE", "%-d. November %Y um 17:00"), ("en-US", "7:00 AM")]
 )
-def test_a_visitor_sees_when_the_link_ends(browser: Browser, url: str, finished: str, locale: str, words: str) -> None:
+def test_share_link_expiry_is_in_local_time(browser: Browser, url: str, finished: str, locale: str, words: str) -> None:
     link, _ = share(url, finished, expires_in=86400)
     zone = {"en-GB": "Europe/London", "de-DE": "Europe/Athens", "en-US": "America/Los_Angeles"}[locale]
     page = visitor(browser, locale=locale, timezone_id=zone)
@@ -152,7 +152,7 @@ def test_a_visitor_sees_when_the_link_ends(browser: Browser, url: str, finished:
     page.context.close()
 
 
-def test_a_link_that_ends_while_it_is_open_says_so(browser: Browser, url: str, finished: str) -> None:
+def test_a_share_link_that_expires_while_open_says_so(browser: Browser, url: str, finished: str) -> None:
     link, _ = share(url, finished, expires_in=3600)
     page = visitor(browser, locale="en-GB")
     page.clock.install()
@@ -160,12 +160,12 @@ def test_a_link_that_ends_while_it_is_open_says_so(browser: Browser, url: str, f
     expect(page.locator(".until")).to_contain_text("The link is valid until")
     expect(page.get_by_role("heading", name="a finished face")).to_be_visible()
     page.clock.fast_forward("01:00:30")
-    expect(page.locator(".until")).to_contain_text("what is shown stays until you close or reload this page")
+    expect(page.locator(".until")).to_contain_text("This result stays visible until you close or reload the page.")
     expect(page.get_by_role("heading", name="a finished face")).to_be_visible()
     page.context.close()
 
 
-def test_a_link_that_has_ended_is_a_sentence(browser: Browser, url: str, finished: str) -> None:
+def test_an_expired_share_link_shows_when_it_expired_and_no_controls(browser: Browser, url: str, finished: str) -> None:
     link, _ = share(url, finished)
     page = visitor(browser, locale="en-GB", timezone_id="Europe/London")
     problem = {
@@ -174,7 +174,7 @@ def test_a_link_that_has_ended_is_a_sentence(browser: Browser, url: str, finishe
     }  # fmt: skip
     page.route("**/v1/**", lambda route: route.fulfill(status=401, json=problem))
     page.goto(link)
-    expect(page.get_by_role("heading", name="This result can no longer be seen")).to_be_visible()
+    expect(page.get_by_role("heading", name="This result is no longer available")).to_be_visible()
     expect(page.get_by_text("The link expired on 5 March 2024 at 09:30. Ask its sender for a new one.")).to_be_visible()
     for role in ("alert", "textbox", "button"):
         expect(page.get_by_role(role)).to_have_count(0)  # type: ignore[arg-type]

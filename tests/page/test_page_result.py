@@ -26,7 +26,7 @@ pytestmark = [
 ]
 
 
-def test_all_views_of_a_result_differ(page: Page, url: str, finished: str) -> None:
+def test_each_colouring_overlay_and_view_changes_the_picture(page: Page, url: str, finished: str) -> None:
     page.goto(f"{url}/#job={finished}")
     canvas = page.locator(".view canvas")
     canvas.wait_for(timeout=DONE)
@@ -39,7 +39,7 @@ def test_all_views_of_a_result_differ(page: Page, url: str, finished: str) -> No
     def different() -> float:
         return differing_pixels(plain, canvas.screenshot())
 
-    for colour in ("displacement", "residual", "3-D error", "expected error", "how often seen"):
+    for colour in ("displacement", "residual", "3-D error", "expected error", "visibility"):
         page.get_by_label("Colour", exact=True).select_option(label=colour)
         expect(page.locator(".legend")).to_be_visible()
         until(lambda: different() > 0.02)
@@ -63,13 +63,13 @@ def test_all_views_of_a_result_differ(page: Page, url: str, finished: str) -> No
     until(lambda: different() == 0)
 
 
-def test_the_animation_stops_loops_or_reverses_at_the_chosen_speed(page: Page, url: str, finished: str) -> None:
+def test_the_animation_stops_loops_or_reverses_at_its_end(page: Page, url: str, finished: str) -> None:
     page.goto(f"{url}/#job={finished}")
     page.locator(".view canvas").wait_for(timeout=DONE)
     slider = page.get_by_role("slider", name="Frame")
 
     def steps_until(seen: Callable[[np.ndarray], bool]) -> np.ndarray:
-        """How the frame changes, watched until that was seen."""
+        """Watch the frame number until `seen` holds, and return its changes."""
         frames = [float(slider.input_value())]
 
         def watched() -> bool:
@@ -103,7 +103,7 @@ def test_the_animation_stops_loops_or_reverses_at_the_chosen_speed(page: Page, u
 
 @pytest.fixture(scope="module")
 def model(url: str, small: dict[str, bytes]) -> dict[str, Any]:
-    """The record of a job with options and a name that has to be quoted."""
+    """The record of a job with options and a name that needs quoting."""
     options = {"method": "spatio_temporal", "fps": 12.5, "refine_rotations": False}
     files = {"tracks": small[TRACKS], "mesh": small["mesh.npz"], "ground_truth": small["truth.npz"]}
     sent = {"name": "it's a face", "options": json.dumps(options)}
@@ -142,7 +142,7 @@ def test_the_code_shown_submits_the_same_job(
 @pytest.mark.long
 @pytest.mark.usefixtures("front")
 def test_a_dense_result_plays_within_time_and_memory(page: Page, tmp_path: Path) -> None:
-    """99 frames of 29,000 points on the whole road, with known cameras and the method that takes seconds."""
+    """99 frames of 29,000 points end to end, with known cameras and the method that takes seconds."""
     sequence = face(99, 29_000)
     for part, label, arrays in (
         ("tracks", "Tracks", {"tracks": sequence.tracks.points.astype(np.float32)}),
@@ -153,7 +153,7 @@ def test_a_dense_result_plays_within_time_and_memory(page: Page, tmp_path: Path)
         page.get_by_label(label, exact=True).set_input_files(tmp_path / f"{part}.npz")
     seen = page.get_by_role("region", name="How your files are interpreted")
     expect(seen).to_contain_text("99 frames of 29,000 points", timeout=30_000)
-    page.get_by_text("For experts").click()
+    page.get_by_text("Advanced").click()
     page.get_by_label("Method").select_option(label="pseudo-inverse")
     page.get_by_label("Refine cameras").uncheck()
     page.get_by_role("button", name="Reconstruct").click()

@@ -31,7 +31,7 @@ def test_files_are_submitted_and_the_result_plays(page: Page, url: str, small: d
     expect(seen.get_by_role("img", name="Sample of the tracks")).to_be_visible()
     painted = "(it) => it.getContext('2d').getImageData(0, 0, it.width, it.height).data.filter((v, i) => i % 4 === 3 && v > 0).length"
     assert seen.get_by_role("img", name="Sample of the tracks").evaluate(painted) > 200 * 9  # a dot each of 200 points
-    page.get_by_text("For experts").click()
+    page.get_by_text("Advanced").click()
     page.get_by_label("Preset").select_option(label="as published")
     page.get_by_label("name (optional)").fill("my flag")
     page.get_by_role("button", name="Reconstruct").click()
@@ -82,7 +82,7 @@ def test_an_error_is_shown_with_the_services_message(page: Page, url: str) -> No
     expect(alert).to_contain_text("Choose a file of one of these kinds; the guide shows an example of each.")
     expect(alert.get_by_role("link", name="What files can I send?")).to_have_attribute("href", "guide#tracks")
     expect(alert.get_by_role("link", name="About this error")).to_have_attribute("href", f"errors/{problem['code']}")
-    expect(page.get_by_text("Not sent: see “Tracks” above.")).to_be_visible()
+    expect(page.get_by_text("Not submitted: see “Tracks” above.")).to_be_visible()
     expect(alert).to_contain_text(problem["code"])
     assert "#job" not in page.url
     choose(page, {TRACKS: packed(tracks=np.zeros((2, 50, 2)))})
@@ -97,7 +97,7 @@ def test_dropped_files_are_assigned_to_their_parts(page: Page, url: str, small: 
         expect(page.locator(f"[data-part={part}]")).to_contain_text(name)
     expect(page.get_by_role("region", name="How your files are interpreted")).to_contain_text("10 frames of 300 points")
     page.get_by_role("button", name="Remove mesh").click()
-    expect(page.get_by_role("region", name="How your files are interpreted")).to_contain_text("made by triangulating")
+    expect(page.get_by_role("region", name="How your files are interpreted")).to_contain_text("triangulated in")
     page.get_by_label("or points on a grid").fill("15×20")
     page.get_by_label("or points on a grid").press("Tab")
     expect(page.get_by_role("region", name="How your files are interpreted")).to_contain_text(

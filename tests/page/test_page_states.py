@@ -1,6 +1,6 @@
-"""Every state that a first-time user meets: no accessibility finding, no overflow, targets of 24 px.
+"""Accessibility, overflow and targets of 24 px in every state that a first-time user meets.
 
-With PLIANT_SCREENSHOTS=FOLDER also a picture of each, in both widths and themes.
+PLIANT_SCREENSHOTS=FOLDER also saves a screenshot of each state, in both widths and themes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ pytestmark = [
 
 AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 RUN = "axe.run({rules: {'target-size': {enabled: true}}}).then((found) => found.violations)"
-"""With the rule of WCAG 2.2 that axe leaves out by default: targets of 24 px, or as much space around them."""
+"""Includes the WCAG 2.2 rule that axe disables by default: targets of 24 px, or as much space around them."""
 
 VIEWS = ((390, "light"), (1280, "dark"))
 MORE_VIEWS = ((390, "dark"), (1280, "light"))
@@ -57,7 +57,7 @@ def check(page: Page) -> Check:
 
 
 @pytest.mark.usefixtures("front")
-def test_before_a_job(page: Page, url: str, small: dict[str, bytes], check: Check) -> None:
+def test_the_submission_form_is_accessible(page: Page, url: str, small: dict[str, bytes], check: Check) -> None:
     page.get_by_role("button", name="breathing sphere").wait_for()
     page.get_by_text("Files to write", exact=True).click()
     check("first-view")
@@ -72,12 +72,12 @@ def test_before_a_job(page: Page, url: str, small: dict[str, bytes], check: Chec
     )
     page.get_by_role("button", name="Reconstruct").click()
     expect(page.locator("[data-part=tracks]").get_by_role("alert")).to_contain_text(
-        "Expected point tracks, got a film (mp4 or mov).Choose it under Film instead: its points are followed for you."
+        "Expected point tracks, got a film (mp4 or mov).Choose it under Film instead; its points are tracked for you."
     )
     check("refused-video")
 
 
-def test_while_a_job_runs(page: Page, url: str, long_job: Callable[[str], str], check: Check) -> None:
+def test_unfinished_jobs_are_accessible(page: Page, url: str, long_job: Callable[[str], str], check: Check) -> None:
     id = long_job("running")
     behind = long_job("behind it")
     page.goto(f"{url}/#job={id}")
@@ -87,12 +87,12 @@ def test_while_a_job_runs(page: Page, url: str, long_job: Callable[[str], str], 
     expect(page.get_by_text("Next in the queue.")).to_be_visible()
     check("queued")
     page.get_by_role("button", name="Cancel").click()
-    words = "This job was cancelled before it was done, so it has no results. “Try again” runs it from the same files."
+    words = "This job was cancelled before it finished, so it has no result. “Try again” runs it with the same files."
     expect(page.get_by_text(words, exact=True)).to_be_visible()
     check("cancelled")
 
 
-def test_a_finished_job(page: Page, url: str, finished: str, check: Check) -> None:
+def test_finished_and_shared_jobs_are_accessible(page: Page, url: str, finished: str, check: Check) -> None:
     page.goto(f"{url}/#job={finished}")
     page.locator(".view canvas").wait_for(timeout=DONE)
     page.get_by_role("region", name="Verdict").wait_for()
@@ -100,14 +100,14 @@ def test_a_finished_job(page: Page, url: str, finished: str, check: Check) -> No
     link = httpx.post(f"{url}/v1/jobs/{finished}/shares", json={}).json()["path"]
     page.goto("about:blank")  # otherwise only the part after # changes, and the page reloads itself
     page.goto(f"{url}/{link.removeprefix('/')}")
-    page.get_by_text("You see a shared result, read-only.").wait_for()
+    page.get_by_text("This is a shared, read-only result.").wait_for()
     page.locator(".view canvas").wait_for(timeout=DONE)
     expect(page.get_by_label("Compare with")).to_have_count(0)
     expect(page.get_by_text("Use a token for anything else")).to_have_count(0)
     check("shared")
 
 
-def test_what_cannot_be_shown(page: Page, url: str, finished: str, check: Check) -> None:
+def test_missing_locked_and_expired_pages_are_accessible(page: Page, url: str, finished: str, check: Check) -> None:
     page.goto(f"{url}/#job=0123456789abcdef")
     expect(page.get_by_role("heading", name="This job does not exist")).to_be_visible()
     check("deleted-job")
@@ -124,12 +124,12 @@ def test_what_cannot_be_shown(page: Page, url: str, finished: str, check: Check)
     page.route("**/v1/**", lambda route: route.fulfill(status=401, json=ended))
     page.goto("about:blank")
     page.goto(f"{url}/#share=share.{finished}.secret")
-    expect(page.get_by_role("heading", name="This result can no longer be seen")).to_be_visible()
+    expect(page.get_by_role("heading", name="This result is no longer available")).to_be_visible()
     check("share-ended")
 
 
-def test_the_api_reference(page: Page, url: str, check: Check) -> None:
+def test_the_api_reference_is_accessible(page: Page, url: str, check: Check) -> None:
     page.goto(f"{url}/docs")
     page.get_by_role("heading", name="Pliant 0").wait_for()
-    # Swagger UI has a link inside the button of each operation, a line of text high.
+    # Swagger UI puts a link, one line of text high, inside the button of each operation.
     check("reference", accepted={"nested-interactive", "target-size"})

@@ -24,12 +24,12 @@ REASONS = ["The camera turns by 9°. Turn by 30° or more.", "12 % of the observ
 
 
 def judge(page: Page, url: str, id: str, **fields: Any) -> None:
-    """Show the job as if its record had these fields: each verdict needs a result of its own otherwise."""
+    """Serve the job's record with these fields, so that not every verdict needs its own solve."""
     record = {**httpx.get(f"{url}/v1/jobs/{id}").json(), **fields}
     record = {name: value for name, value in record.items() if value is not ...}
 
     def listed(route: Route) -> None:
-        # Not `route.fetch`, whose answer is gone where the page has moved on.
+        # Not `route.fetch`, which fails once the page has navigated away.
         jobs = httpx.get(route.request.url).json()
         jobs["jobs"] = [record if job["id"] == id else job for job in jobs["jobs"]]
         route.fulfill(json=jobs)
@@ -55,12 +55,12 @@ def test_the_verdict_is_above_the_viewer_and_in_the_list(
     box = page.get_by_role("region", name="Verdict")
     expect(box).to_contain_text(words)
     expect(box).to_contain_text(TRUST)
-    expect(box).to_contain_text("In nearly eight of ten sequences the true error is between 2.0 % and 5.1 %.")
+    expect(box).to_contain_text("Likely range of the true error: 2.0 % to 5.1 % (correct in nearly eight of ten")
     figures = {
         "Turn between the most different views": "63°",
         "Turn per frame (median)": "2.1°",
         "Change of shape per frame (median)": "1.2 % of the object's size",
-        "Left-out observations, distance from their prediction (median)": "below 0.1 % of the object's size",
+        "Prediction error of held-out observations (median)": "below 0.1 % of the object's size",
     }
     box.get_by_text("Figures behind the verdict").click()
     expect(box.get_by_role("term")).to_have_text(list(figures))
@@ -68,7 +68,7 @@ def test_the_verdict_is_above_the_viewer_and_in_the_list(
     expect(box.locator("svg")).to_be_visible()
     expect(box.get_by_role("listitem")).to_have_text(reasons)
     expect(box).to_contain_text("Solver: Converged.")
-    expect(page.get_by_role("article").get_by_text("Converged.")).to_have_count(1)  # beside the verdict, nowhere alone
+    expect(page.get_by_role("article").get_by_text("Converged.")).to_have_count(1)  # only beside the verdict
     expect(page.get_by_role("link", name=re.compile("a finished face(?!:)"))).to_contain_text(words)
     canvas = page.locator(".view canvas")
     canvas.wait_for(timeout=DONE)
@@ -83,12 +83,12 @@ def test_a_job_without_a_verdict_shows_none(page: Page, url: str, finished: str)
     page.goto(f"{url}/#job={finished}")
     expect(page.get_by_text("Converged. The quality of this result was not assessed.")).to_be_visible()
     expect(page.get_by_role("region", name="Verdict")).to_have_count(0)
-    link = page.locator(f'a[href="#job={finished}"]')  # by name, jobs made from it would be found, too
+    link = page.locator(f'a[href="#job={finished}"]')  # a search by name would also match jobs derived from it
     expect(link).to_contain_text("Done")
     expect(link.locator(".badge")).to_have_count(0)
 
 
-def test_every_badge_can_be_read_in_both_themes(page: Page, url: str, finished: str) -> None:
+def test_verdict_badges_are_accessible_in_both_themes(page: Page, url: str, finished: str) -> None:
     if not AXE.is_file() and not os.environ.get("CI"):
         pytest.skip("axe-core is not installed; say `make page`")
     for width, verdict in ((1280, "good"), (390, "with_care"), (390, "do_not_use")):

@@ -33,7 +33,7 @@ HALF_TURN = 24
 
 @pytest.fixture(scope="module")
 def jobs(url: str) -> tuple[str, str]:
-    """Two finished jobs of the same points: with hidden points and outliers, and clean."""
+    """Two finished jobs on the same points: one with hidden points and outliers, one clean."""
     ids = []
     for name, sequence in (
         ("spoiled flag", corrupt(flag(FRAMES, POINTS), outliers=0.03, hidden=0.15, seed=5)),
@@ -65,7 +65,7 @@ def shared(browser: Browser, url: str, jobs: tuple[str, str]) -> Iterator[Page]:
 
 @pytest.fixture
 def viewer(shared: Page) -> Page:
-    """The page with the view as it is after opening."""
+    """The shared page, reset to the view it opens with."""
     shared.get_by_label("Colour", exact=True).select_option("plain")
     shared.get_by_role("button", name="Front").click()
     seek(shared, 3)
@@ -110,7 +110,7 @@ def test_picture_and_tools_are_visible_without_scrolling(viewer: Page) -> None:
     viewer.set_viewport_size({"width": 1280, "height": 800})
 
 
-def test_views_show_other_sides_and_fit_brings_the_mesh_back(viewer: Page) -> None:
+def test_view_keys_rotate_the_mesh_and_the_fit_key_resets_the_zoom(viewer: Page) -> None:
     canvas(viewer).press("1")  # the focused canvas is outlined
     viewer.wait_for_timeout(200)
     front = canvas(viewer).screenshot()
@@ -136,7 +136,7 @@ def test_a_point_is_chosen_by_click_by_key_and_by_number(viewer: Page, url: str,
     middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     number = viewer.get_by_role("spinbutton", name="Point")
     viewer.mouse.click(*middle)
-    until(lambda: "Now" in facts(viewer))
+    until(lambda: "In this frame" in facts(viewer))
     clicked = number.input_value()
     viewer.get_by_role("button", name="Clear").click()
     canvas(viewer).press("Enter")
@@ -150,19 +150,19 @@ def test_a_point_is_chosen_by_click_by_key_and_by_number(viewer: Page, url: str,
         number.fill("")
         expect(viewer.locator(".probe dt")).to_have_count(0)
         number.fill(str(point))
-        until(lambda point=point: "Now" in facts(viewer))  # type: ignore[misc]
+        until(lambda point=point: "In this frame" in facts(viewer))  # type: ignore[misc]
         shown = facts(viewer)
         position = [float(each) for each in shown["Position"].removesuffix(" (tracks' unit)").split(", ")]
         np.testing.assert_allclose(position, shapes[3, point], atol=2e-3 * size)
         assert float(shown["Expected error"].split("\u00a0%")[0]) == pytest.approx(
             100 * spread[3, point] / size, rel=0.06
         )
-        assert re.match(rf"\d+ of {FRAMES} frames", shown["Seen in"])
-    assert facts(viewer)["Now"].startswith(("hidden", "rejected"))
+        assert re.match(rf"\d+ of {FRAMES} frames", shown["Visible in"])
+    assert facts(viewer)["In this frame"].startswith(("hidden", "rejected"))
     number.fill("")
 
 
-def test_the_timeline_moves_by_key_and_states_each_frames_values(viewer: Page) -> None:
+def test_the_timeline_responds_to_keys_and_describes_each_frame(viewer: Page) -> None:
     slider = viewer.get_by_role("slider", name="Frame")
     slider.focus()
     texts = set()
@@ -179,11 +179,11 @@ def test_the_timeline_moves_by_key_and_states_each_frames_values(viewer: Page) -
     expect(viewer.locator(".clock")).to_have_text(f"4 / {FRAMES}")
 
 
-def test_hidden_positions_are_grey_and_the_legend_states_the_unit(viewer: Page) -> None:
+def test_the_legend_states_units_and_the_meaning_of_grey(viewer: Page) -> None:
     viewer.get_by_label("Colour", exact=True).select_option("expected")
     legend = viewer.locator(".legend")
     expect(legend).to_contain_text("% of the size")
-    expect(legend).to_contain_text("grey: not seen")
+    expect(legend).to_contain_text("grey: hidden")
     viewer.get_by_label("Colour", exact=True).select_option("seen")
     expect(legend).to_contain_text(f"{FRAMES} of {FRAMES} frames")
     viewer.get_by_label("Colour", exact=True).select_option("residual")
@@ -192,7 +192,7 @@ def test_hidden_positions_are_grey_and_the_legend_states_the_unit(viewer: Page) 
     assert top < 1  # the outliers are tens of units away and rejected
 
 
-def test_tracks_stand_beside_the_mesh_and_the_mesh_over_them(viewer: Page) -> None:
+def test_tracks_are_shown_beside_the_mesh_and_can_be_overlaid_with_it(viewer: Page) -> None:
     viewer.get_by_role("checkbox", name="Tracks beside").check()
     tracks = viewer.get_by_role("img", name="The tracks at the same moment")
     until(lambda: tracks.evaluate("(it) => it.width") > 100)
@@ -208,7 +208,7 @@ def test_tracks_stand_beside_the_mesh_and_the_mesh_over_them(viewer: Page) -> No
     expect(tracks).to_have_count(0)
 
 
-def test_another_job_is_compared_point_by_point(viewer: Page) -> None:
+def test_another_job_is_compared_side_by_side(viewer: Page) -> None:
     viewer.get_by_label("Compare with").select_option(label="clean flag")
     other = viewer.get_by_role("img", name="The other job's result, from the same side")
     other.wait_for()
@@ -216,7 +216,7 @@ def test_another_job_is_compared_point_by_point(viewer: Page) -> None:
         viewer.get_by_text(re.compile(r"Expected error: this job [\d.]+\s% of the size, clean flag"))
     ).to_be_visible()
     expect(viewer.locator(".legend")).to_contain_text("Expected error, “spoiled flag” minus “clean flag”")
-    expect(viewer.locator(".legend")).to_contain_text("grey: not seen in one of the two")
+    expect(viewer.locator(".legend")).to_contain_text("grey: hidden in one of the two")
     expect(viewer.locator(".view-name")).to_have_text(["spoiled flag (this job)", "clean flag"])
     viewer.wait_for_timeout(300)
     before = other.screenshot()
@@ -227,7 +227,7 @@ def test_another_job_is_compared_point_by_point(viewer: Page) -> None:
 
 
 def painted() -> bytes:
-    """A preview of a flag whose left half is red and whose right half is blue in the film's picture; its depth has the wrong sign."""
+    """A preview of a flag textured red on the left and blue on the right; its depth has the wrong sign."""
     sequence = flag(FRAMES, POINTS)
     cameras = KnownCamera.from_arrays(sequence.rotations, sequence.scales)
     solution = solve(sequence.tracks, sequence.mesh, cameras=cameras)
@@ -247,7 +247,7 @@ def painted() -> bytes:
     return into.getvalue()
 
 
-def test_a_films_picture_is_on_the_mesh_first_and_after_a_comparison(
+def test_film_texture_is_the_default_and_returns_after_a_comparison(
     page: Page, url: str, jobs: tuple[str, str]
 ) -> None:
     preview = painted()
@@ -269,7 +269,7 @@ def test_a_films_picture_is_on_the_mesh_first_and_after_a_comparison(
     until(lambda: min(halves()) > 0.1)
     flip, why = (
         page.get_by_role("checkbox", name="Flip depth"),
-        page.get_by_text("Depth is mirrored to match the ground truth; files are not."),
+        page.get_by_text("Depth is mirrored to match the ground truth; the files are not."),
     )
     expect(flip).to_be_checked()
     expect(why).to_be_visible()
@@ -284,9 +284,9 @@ def test_a_films_picture_is_on_the_mesh_first_and_after_a_comparison(
     until(lambda: min(halves()) > 0.1)
 
 
-def test_the_back_of_a_surface_is_darker_and_the_view_fills_the_screen(viewer: Page) -> None:
+def test_back_faces_are_darker_and_f_toggles_full_screen(viewer: Page) -> None:
     def brightness() -> float:
-        """Of the middle of the picture, which the mesh covers."""
+        """Median brightness of the picture's centre, which the mesh covers."""
         with Image.open(io.BytesIO(canvas(viewer).screenshot())) as shot:
             pixels = np.asarray(shot.convert("L"), dtype=float)
         (height, width), tenth = pixels.shape, min(pixels.shape) // 10
@@ -312,7 +312,7 @@ def test_help_opens_and_closes_by_keyboard(viewer: Page) -> None:
     expect(help_).to_have_count(0)
 
 
-def test_picture_film_and_page_are_saved(viewer: Page, tmp_path: Path) -> None:
+def test_picture_video_and_offline_page_can_be_saved(viewer: Page, tmp_path: Path) -> None:
     saved = {}
     for name in ("Picture", "HTML page", "Camera's film"):
         with viewer.expect_download() as download:
@@ -337,7 +337,7 @@ def test_picture_film_and_page_are_saved(viewer: Page, tmp_path: Path) -> None:
     context.close()
 
 
-def test_a_turntable_turns_the_mesh_and_can_be_stopped(viewer: Page) -> None:
+def test_turntable_recording_rotates_the_mesh_and_can_be_stopped(viewer: Page) -> None:
     canvas(viewer).focus()
     before = canvas(viewer).screenshot()
     viewer.get_by_role("button", name="Turntable").click()

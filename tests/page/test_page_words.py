@@ -43,7 +43,7 @@ def node() -> list[str]:
 
 
 def evaluate(module: str, expression: str) -> Any:
-    """The value of an expression in which `module` is a module of the page."""
+    """Evaluate a JavaScript expression in which `module` is a module of the page."""
     script = RUN.replace("MODULE", module).replace("EXPRESSION", expression)
     command = [*node(), "--input-type=module", "-e", script]
     ran = subprocess.run(command, cwd=WEB, capture_output=True, text=True, timeout=60, check=False)
@@ -51,7 +51,7 @@ def evaluate(module: str, expression: str) -> Any:
     return json.loads(ran.stdout)
 
 
-def test_shares_of_the_size_have_no_exponents_and_no_line_ends() -> None:
+def test_percentages_of_the_size_use_no_exponents_and_do_not_wrap() -> None:
     shares = [3.91, 0.996, 0.0995, 0.0345, 0.001, 0.00001, 0.000001, 5e-324, 0, 12.345]
     shown = evaluate("words", f"{shares}.map(module.ofSize)")
     digits = ["391", "100", "10", "3.5", "0.10", "0.0010", "0.00010", "0", "0", "1,235"]
@@ -67,12 +67,12 @@ def test_a_running_job_names_its_reweighting_and_the_time_left() -> None:
     assert evaluate("words", f"module.standing({job})") == "Refining the shapes, reweighting 3; about 12 seconds left."
 
 
-def test_lengths_in_the_picture_have_a_unit() -> None:
+def test_image_lengths_have_a_unit() -> None:
     words = "['film', 'given'].map((source) => module.inTracksUnit(0.5, {interpretation: {mesh_source: source}}))"
     assert evaluate("words", words) == ["0.500 pixels", "0.500 (tracks' unit)"]
 
 
-def test_the_difference_of_errors_is_grey_where_one_job_does_not_show_a_point() -> None:
+def test_error_difference_is_grey_where_a_point_is_hidden_in_one_job() -> None:
     jobs = """[[[0, 1, 2], [1, 3, 2]], [[2, 1, 1], [0, 3, 2]], [[2, 4, 1], [0, 0, 0]]].map(([spread, residuals], at) => ({
       title: "abc"[at],
       preview: {
@@ -93,7 +93,7 @@ def test_the_difference_of_errors_is_grey_where_one_job_does_not_show_a_point() 
           }}));
         }})()""",
     )
-    unknown = "not seen in one of the two"
+    unknown = "hidden in one of the two"
     ends = ["−2.0\u00a0% of the size", "+2.0\u00a0% of the size"]
     assert shown == [
         ["Expected error, “a” minus “b”", *ends, True, unknown, [0, -32767, 24575]],

@@ -1,4 +1,4 @@
-"""The whole service on a free port, on a real embedded Valkey and a real directory of blobs."""
+"""The whole service on a free port, with a real embedded Valkey and a real blob directory."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def valkey_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def serve(valkey_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serve]:
-    """Start a service with settings of one's own; it ends with the module."""
+    """Start services with custom settings; they stop with the module."""
     started: list[tuple[uvicorn.Server, threading.Thread]] = []
 
     def start(

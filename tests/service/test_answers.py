@@ -1,4 +1,4 @@
-"""Ranges, events, waiting, and requests rejected before their body is read."""
+"""Downloads, readiness, events, waits, origin checks, and an unavailable store."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_file_is_sent_completely_with_its_digest(http: httpx.Client, address: 
     assert [(each["name"], each["sha256"]) for each in listed] == [("shapes.npz", digest.hexdigest())]
 
 
-def test_an_interrupted_download_is_resumed(http: httpx.Client, address: str) -> None:
+def test_downloads_support_ranges_and_preconditions(http: httpx.Client, address: str) -> None:
     tag = http.head(address).headers["etag"]
     rest = http.get(address, headers={"Range": "bytes=1234567-", "If-Range": tag})
     assert (rest.status_code, rest.content) == (206, CONTENTS[1234567:])
@@ -61,7 +61,7 @@ def test_an_interrupted_download_is_resumed(http: httpx.Client, address: str) ->
     assert http.get(address + "x").json()["code"] == "unknown_artifact"
 
 
-def test_a_file_deleted_during_a_download_is_gone(
+def test_a_file_deleted_before_or_during_a_download_returns_410(
     running: Running, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = submit(http, name="gone")
@@ -80,7 +80,7 @@ def test_a_file_deleted_during_a_download_is_gone(
     assert (answer.status_code, answer.json()["code"]) == (404, "unknown_job")
 
 
-def test_an_api_process_without_workers_is_ready_by_itself(http: httpx.Client) -> None:
+def test_readiness_can_exclude_the_workers(http: httpx.Client) -> None:
     whole = http.get("/readyz")
     assert (whole.status_code, whole.json()["code"]) == (503, "not_ready")
     assert "No worker" in whole.json()["detail"]
@@ -119,7 +119,7 @@ def test_waiting_ends_with_the_job_or_its_time_limit(running: Running, http: htt
     timer.join()
 
 
-def test_every_answer_has_the_security_headers(http: httpx.Client) -> None:
+def test_errors_and_health_checks_have_the_security_headers(http: httpx.Client) -> None:
     for answer in (http.get("/healthz"), http.get("/nowhere"), http.get("/v1/jobs/nobody")):
         assert answer.headers["content-security-policy"].startswith("default-src 'none'")
         assert answer.headers["x-content-type-options"] == "nosniff"
@@ -130,7 +130,7 @@ def test_every_answer_has_the_security_headers(http: httpx.Client) -> None:
     ("method", "path", "status", "code"),
     [("GET", "/nowhere", 404, "no_such_address"), ("DELETE", "/v1/options", 405, "method_not_allowed")],
 )
-def test_errors_of_the_framework_are_problem_documents(
+def test_framework_errors_are_problem_documents(
     http: httpx.Client, method: str, path: str, status: int, code: str
 ) -> None:
     answer = http.request(method, path)
@@ -147,21 +147,21 @@ def test_errors_of_the_framework_are_problem_documents(
         ({"Origin": "null"}, 403),
     ],
 )
-def test_a_page_of_another_site_cannot_write(running: Running, headers: dict[str, str], status: int) -> None:
+def test_other_origins_and_hosts_cannot_write(running: Running, headers: dict[str, str], status: int) -> None:
     before = running.waiting
     answer = httpx.post(f"{running.url}/v1/jobs", content=b"", headers=headers)
     assert answer.status_code == status
     assert running.waiting == before
 
 
-def test_a_page_of_an_allowed_origin_can_write(serve: Serve) -> None:
+def test_an_allowed_origin_passes_the_origin_check(serve: Serve) -> None:
     running = serve(cors_origins=("https://good.example",))
     headers = {"Origin": "https://good.example"}
     answer = httpx.post(f"{running.url}/v1/jobs", content=b"x", headers=headers)
     assert (answer.status_code, answer.headers["access-control-allow-origin"]) == (415, "https://good.example")
 
 
-def test_without_its_store_the_service_returns_503_and_keeps_nothing(serve: Serve, tmp_path: Path) -> None:
+def test_requests_return_503_if_the_store_is_unreachable(serve: Serve, tmp_path: Path) -> None:
     running = serve(redis_url=f"unix://{tmp_path}/nobody.sock")
     assert httpx.get(f"{running.url}/healthz").status_code == 200
     assert httpx.get(f"{running.url}/readyz").json()["code"] == "not_ready"
@@ -171,7 +171,7 @@ def test_without_its_store_the_service_returns_503_and_keeps_nothing(serve: Serv
     assert answer.headers["retry-after"] == "2"
 
 
-def test_a_job_is_deleted_while_the_blob_store_is_away(
+def test_a_job_can_be_deleted_while_the_blob_store_is_down(
     running: Running, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     id = submit(http).id
@@ -187,17 +187,17 @@ def test_a_job_is_deleted_while_the_blob_store_is_away(
     assert set(running.jobs.records.deleted()) >= {id}, "the reconciler removes the files later"
 
 
-def test_every_error_of_the_worker_has_a_status() -> None:
+def test_every_worker_error_has_a_status() -> None:
     kinds = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, errors.WorkerError)]
     assert len(kinds) > 8
     assert all(any(base in STATUS_OF for base in kind.__mro__) for kind in kinds)
 
 
-def test_while_the_store_hangs_requests_fail_in_time_and_the_process_is_live(
+def test_requests_time_out_and_health_checks_pass_if_the_store_hangs(
     serve: Serve, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pliant.worker.store.connection.ANSWER_WITHIN", 2.0)
-    with socket.create_server(("127.0.0.1", 0), backlog=200) as deaf:  # the kernel accepts for it
+    with socket.create_server(("127.0.0.1", 0), backlog=200) as deaf:  # the kernel accepts; nothing replies
         running = serve(redis_url=f"redis://127.0.0.1:{deaf.getsockname()[1]}")
         answers: list[int] = []
         http = httpx.Client(base_url=running.url, timeout=30)
@@ -205,7 +205,7 @@ def test_while_the_store_hangs_requests_fail_in_time_and_the_process_is_live(
         def ask() -> None:
             answers.append(http.get("/v1/jobs/some-job").status_code)
 
-        threads = [threading.Thread(target=ask) for _ in range(60)]  # more than there are threads for them
+        threads = [threading.Thread(target=ask) for _ in range(60)]  # more than the thread pool holds
         began = time.monotonic()
         for thread in threads:
             thread.start()
@@ -219,7 +219,7 @@ def test_while_the_store_hangs_requests_fail_in_time_and_the_process_is_live(
         assert time.monotonic() - began < 10
 
 
-def test_folders_of_killed_processes_are_removed_and_others_kept(tmp_path: Path) -> None:
+def test_scratch_folders_of_dead_processes_are_removed_live_ones_kept(tmp_path: Path) -> None:
     living = Incoming(tmp_path)
     living.open()
     (tmp_path / "dead").mkdir()

@@ -65,7 +65,7 @@ def send(http: httpx.Client, film: bytes | None, **more: object) -> Job:
 
 
 def work(running: Running, id: str) -> Job:
-    """Do as the worker's job process does."""
+    """Run the job as the worker's job process does."""
     attempt.run(id, running.jobs.records.get(id).attempt_id, settings=running.jobs.settings, worker="w")
     return running.jobs.get(id)
 
@@ -86,15 +86,13 @@ def test_a_film_becomes_a_job_with_tracks_and_shapes(running: Running, http: htt
         assert held["tracks"].shape == (10, done.interpretation.num_points, 2)
 
 
-def test_without_a_region_the_whole_picture_is_tracked_with_a_warning(
-    running: Running, http: httpx.Client, film: bytes
-) -> None:
+def test_a_film_without_a_region_succeeds_with_a_warning(running: Running, http: httpx.Client, film: bytes) -> None:
     done = work(running, send(http, film, options=QUICK).id)
     assert done.status is Status.SUCCEEDED, done.error
     assert any("No region was given" in sentence for sentence in done.warnings)
 
 
-def test_a_film_can_be_an_upload_and_is_the_same_request(http: httpx.Client, film: bytes) -> None:
+def test_a_film_sent_as_upload_or_form_part_is_the_same_request(http: httpx.Client, film: bytes) -> None:
     for id, content in (("the-film", film), ("the-mask", mask())):
         assert http.put(f"/v1/uploads/{id}", content=content).is_success
     key = {"Idempotency-Key": "once"}
@@ -107,7 +105,7 @@ def test_a_film_can_be_an_upload_and_is_the_same_request(http: httpx.Client, fil
     assert put.status_code == 202, put.text
 
 
-def test_inspection_opens_a_film_and_tracks_nothing(running: Running, http: httpx.Client, film: bytes) -> None:
+def test_inspection_reads_a_film_without_tracking_it(running: Running, http: httpx.Client, film: bytes) -> None:
     before = running.waiting
     answer = http.post("/v1/inspect", files=parts(film, region=mask()))
     assert answer.status_code == 200, answer.text
@@ -120,8 +118,8 @@ def test_inspection_opens_a_film_and_tracks_nothing(running: Running, http: http
 KINDS = "an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures"
 
 
-def test_a_refused_film_has_the_users_name(http: httpx.Client, film: bytes) -> None:
-    """As given in the form, without its folder; for an upload, whose file has no name, that of the job."""
+def test_film_errors_use_the_users_file_name(http: httpx.Client, film: bytes) -> None:
+    """The form's file name without its folder; for an upload, which has no file name, the job's name."""
     sentence = f"film: expected {KINDS}, got {{}}, which is none of these. Convert it: ffmpeg -i FILM film.mp4"
     answer = http.post("/v1/inspect", files={"film": ("../films/my take 3.mp4", b"%PDF-1.7")})
     assert answer.json()["detail"] == sentence.format("my take 3.mp4")
@@ -132,14 +130,14 @@ def test_a_refused_film_has_the_users_name(http: httpx.Client, film: bytes) -> N
     assert "got my mask.png: " in http.post("/v1/inspect", files=wrong).json()["detail"]
 
 
-def test_the_users_name_is_one_component_on_one_line() -> None:
+def test_file_names_are_reduced_to_one_component_on_one_line() -> None:
     assert own_name("C:\\films\\my take 3.mp4") == "my take 3.mp4"
     assert own_name("../two\tlines\u2028.mp4") == "two lines .mp4"
     assert len(own_name("a" * 5000)) == 200
 
 
 def huge(path: Path) -> bytes:
-    """Pictures that state 5,000 × 5,000 pixels."""
+    """Pictures whose headers declare 5,000 × 5,000 pixels."""
     picture = png(5000, 5000, data=zlib.compress(bytes(1000)))
     return films.zip_of(path, dict.fromkeys(("1.png", "2.png", "3.png"), picture)).read_bytes()
 
@@ -155,7 +153,7 @@ BAD: dict[str, tuple[dict[str, object], str, str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_files_that_are_not_films_are_rejected_with_a_message(running: Running, http: httpx.Client, case: str) -> None:
+def test_invalid_films_and_part_combinations_are_rejected(running: Running, http: httpx.Client, case: str) -> None:
     given, code, field = BAD[case]
     files = {name: (None, value) if isinstance(value, str) else (name, value) for name, value in given.items()}
     refused(running, http, files, code, field)
@@ -172,7 +170,7 @@ def refused(running: Running, http: httpx.Client, files: dict[str, object], code
     assert running.waiting == before
 
 
-def test_broken_and_hostile_films_are_refused(
+def test_broken_films_invalid_regions_and_zip_bombs_are_rejected(
     running: Running, http: httpx.Client, film: bytes, tmp_path: Path
 ) -> None:
     refused(running, http, parts(film[: len(film) // 2]), "truncated_film", "film")
@@ -188,7 +186,7 @@ def test_broken_and_hostile_films_are_refused(
     refused(running, http, parts(bomb.read_bytes()), "too_few_frames", "film")
 
 
-def test_a_film_that_fails_while_it_is_tracked_is_a_failed_job_with_a_remedy(
+def test_a_film_that_cannot_be_tracked_fails_its_job_with_a_remedy(
     running: Running, http: httpx.Client, tmp_path: Path
 ) -> None:
     grey = films.write_film(tmp_path / "grey.mkv", [np.full((72, 96, 3), 128, np.uint8)] * 5)

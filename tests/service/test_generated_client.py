@@ -13,7 +13,7 @@ import pytest
 from serving import Running, finish, tracks, until
 
 GENERATOR = Path(sys.prefix) / "generator" / "bin"
-"""It has an environment of its own: it wants another Typer than the command line."""
+"""In its own environment, because it needs a different Typer than the command line."""
 
 pytestmark = pytest.mark.slow
 

@@ -1,6 +1,6 @@
-"""What the OpenAPI document allows, and what it forbids, asked of a real service by schemathesis: no 5xx, no undeclared answer.
+"""Schemathesis sends valid and invalid requests to a real service: no 5xx, no response that the OpenAPI document lacks.
 
-`PLIANT_EXAMPLES=200 pytest -s tests/service/test_openapi_requests.py` asks more and prints the counts.
+`PLIANT_EXAMPLES=200 pytest -s tests/service/test_openapi_requests.py` sends more requests and prints the counts.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ EXAMPLES = int(os.environ.get("PLIANT_EXAMPLES", "4"))
 """Requests of each kind for each operation."""
 
 UNASKED = [
-    # A schema cannot say that bytes are a track file, so a request that fits it may be refused; and what a query or a header has
-    # beyond what we know is passed over, as HTTP's own headers are.
+    # A schema cannot express that bytes are a track file, so a request that matches it may be rejected; and unknown query
+    # parameters and headers are ignored, as HTTP's own headers are.
     checks.positive_data_acceptance,
     checks.negative_data_rejection,
 ]
@@ -112,7 +112,7 @@ def test_every_response_is_declared(
 
 
 def _plain(part: Any) -> Any:
-    """Write `prefixItems` of one kind as `items`: schemathesis 4.32 turns the former into a schema that it then calls invalid."""
+    """Rewrite uniform `prefixItems` as `items`: schemathesis 4.32 turns the former into a schema that it then rejects."""
     if isinstance(part, list):
         return [_plain(each) for each in part]
     if not isinstance(part, dict):

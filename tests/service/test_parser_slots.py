@@ -1,4 +1,4 @@
-"""Parser slots: one owner with many slow inputs does not make another wait for all of them."""
+"""Parser slots are shared fairly: one owner's many slow inputs do not block another owner's."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from pliant.service.spool import ParserSlots
 
 
-def test_the_owner_with_fewest_slots_is_next_and_all_run() -> None:
+def test_slots_go_to_the_owner_with_fewest_and_every_input_is_parsed() -> None:
     began: list[str] = []
     steps = threading.Semaphore(0)
 

@@ -18,18 +18,18 @@ FOLDERS = ("solver", "tracking", "worker", "service", "client", "cli")
 
 
 @cache
-def sources() -> list[tuple[Path, ast.Module]]:
+def sources() -> list[tuple[Path, list[ast.AST]]]:
     paths = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
-    return [(path, ast.parse(path.read_text())) for path in paths if "testing" not in path.parts]
+    return [(path, list(ast.walk(ast.parse(path.read_text())))) for path in paths if "testing" not in path.parts]
 
 
 def code_parameters() -> dict[str, int]:
     """Return, by qualified name, the position of the parameter `code` of every function and class that has one."""
     found = {"pliant.schemas.invalid.Invalid": 0}
     heirs: dict[str, list[str]] = {}
-    for path, tree in sources():
+    for path, nodes in sources():
         module = "pliant." + ".".join(path.relative_to(ROOT).with_suffix("").parts)
-        for node in ast.walk(tree):
+        for node in nodes:
             if isinstance(node, ast.ClassDef):
                 if not any(isinstance(each, ast.FunctionDef) and each.name == "__init__" for each in node.body):
                     heirs[f"{module}.{node.name}"] = [ast.unparse(base) for base in node.bases]
@@ -42,7 +42,7 @@ def code_parameters() -> dict[str, int]:
                 names = [arg.arg for arg in node.args.args]
                 if "code" in names and names[0] not in ("self", "cls"):
                     found[f"{module}.{node.name}"] = names.index("code")
-    for _ in range(3):  # a class without a constructor of its own has its base's
+    for _ in range(3):  # a class without its own constructor inherits its base's
         at = {name.rsplit(".", 1)[1]: position for name, position in found.items()}
         for name, bases in heirs.items():
             if bases and bases[0] in at:
@@ -55,8 +55,18 @@ def is_name(node: ast.expr) -> bool:
     return isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.isidentifier()
 
 
+def is_attribute(node: ast.expr, of: str, name: str | None = None) -> bool:
+    """Return True for `of.name`, for any attribute of `of` if no name is given."""
+    return (
+        isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and node.value.id == of
+        and name in (None, node.attr)
+    )
+
+
 def literals(node: ast.expr) -> Iterator[str]:
-    """Yield the codes that an expression can be, as far as it names them."""
+    """Yield the literal codes that an expression can evaluate to."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         yield node.value
     elif isinstance(node, ast.IfExp):
@@ -67,14 +77,14 @@ def literals(node: ast.expr) -> Iterator[str]:
 
 
 def raised_codes() -> dict[str, str]:
-    """Return every code that the sources name, with one place where they do."""
+    """Return every code that the sources use, with one place for each."""
     parameters = code_parameters()
     short = {name.rsplit(".", 1)[1] for name in parameters}
     found: dict[str, str] = {}
-    for path, tree in sources():
+    for path, nodes in sources():
         module = "pliant." + ".".join(path.relative_to(ROOT).with_suffix("").parts)
         names = {name.rsplit(".", 1)[1]: name for name in parameters if name.startswith(f"{module}.")}
-        for node in ast.walk(tree):
+        for node in nodes:
             if isinstance(node, ast.ImportFrom) and node.module is not None:
                 for alias in node.names:
                     if alias.name in short:
@@ -83,15 +93,15 @@ def raised_codes() -> dict[str, str]:
                         origin = [name for name in same if name.startswith(f"{node.module}.")]
                         if origin:
                             names[alias.asname or alias.name] = origin[0]
-        for node in ast.walk(tree):
+        for node in nodes:
             codes: list[ast.expr] = []
             if isinstance(node, ast.Call):
                 called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
                 codes += [keyword.value for keyword in node.keywords if keyword.arg == "code"]
-                position = 0 if ast.unparse(node.func) == "Problem.of" else parameters.get(names.get(called, ""))
+                position = 0 if is_attribute(node.func, "Problem", "of") else parameters.get(names.get(called, ""))
                 if position is not None and len(node.args) > position:
                     codes.append(node.args[position])
-                if ast.unparse(node.func) == "super().__init__" and node.args and is_name(node.args[0]):
+                if called == "__init__" and node.args and is_name(node.args[0]):
                     codes.append(node.args[0])
             elif isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
                 targets = node.targets if isinstance(node, ast.Assign) else [node.target]
@@ -100,9 +110,7 @@ def raised_codes() -> dict[str, str]:
             elif isinstance(node, ast.FunctionDef):
                 defaults = dict(zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True))
                 codes += [value for arg, value in defaults.items() if arg.arg == "code" and value is not None]
-            elif (
-                isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "ProblemCode"
-            ) and node.attr.isupper():
+            elif isinstance(node, ast.Attribute) and is_attribute(node, "ProblemCode") and node.attr.isupper():
                 found.setdefault(ProblemCode[node.attr].value, f"{path}:{node.lineno}")
             for each in codes:
                 for code in literals(each):
@@ -110,7 +118,7 @@ def raised_codes() -> dict[str, str]:
     return found
 
 
-def test_the_table_holds_exactly_the_codes_that_the_sources_raise() -> None:
+def test_the_table_has_exactly_the_codes_that_the_sources_use() -> None:
     raised = raised_codes()
     assert len(raised) > 90
     assert {code: place for code, place in raised.items() if find_code(code) is None} == {}, "not in the table"
@@ -152,18 +160,18 @@ def test_the_type_of_a_problem_resolves_to_its_explanation(http: httpx.Client) -
     assert {each["code"] for each in http.get("/errors").json()} == {code.value for code in ProblemCode}
 
 
-def test_the_explanation_of_an_unknown_code_is_404(http: httpx.Client) -> None:
+def test_an_unknown_code_has_no_explanation(http: httpx.Client) -> None:
     answer = http.get("/errors/<b>")
     assert (answer.status_code, answer.json()["code"]) == (422, "invalid_request")
 
 
-def test_a_code_of_a_newer_version_is_a_valid_problem() -> None:
+def test_problems_accept_codes_of_newer_versions() -> None:
     made = Problem.of("from_the_future", 418, detail="Something new. Update.")
     assert (made.title, made.type, made.retryable) == ("I'm a Teapot", "/errors/from_the_future", False)
     assert Problem(title="T", status=500, detail="D.", code="out_of_memory").type == "/errors/out_of_memory"
 
 
-def test_an_error_has_the_usual_status_of_its_code() -> None:
+def test_an_error_defaults_to_the_status_of_its_code() -> None:
     assert Refusal(ProblemCode.BODY_STALLED, detail="D.").status == 408
     assert Refusal(ProblemCode.UNKNOWN_UPLOAD, detail="D.", status=422).status == 422
     assert Refusal(ProblemCode.HTTP_ERROR, detail="D.").status == 500

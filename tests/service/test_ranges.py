@@ -13,7 +13,7 @@ TAG = '"abc"'
     [
         ("bytes=0-0", Slice(206, 0, 1)),
         ("bytes=0-99", Slice(206, 0, 100)),
-        ("bytes=0-100", Slice(206, 0, 100)),  # beyond the end is cut
+        ("bytes=0-100", Slice(206, 0, 100)),  # clipped to the end
         ("bytes=90-", Slice(206, 90, 10)),
         ("bytes=-10", Slice(206, 90, 10)),
         ("bytes=-1000", Slice(206, 0, 100)),
@@ -28,7 +28,7 @@ TAG = '"abc"'
         ("bytes=" + "9" * 30 + "-", Slice(200, 0, 100)),
     ],
 )
-def test_a_range_header_selects_these_bytes(wanted: str, expected: Slice) -> None:
+def test_a_range_header_selects_the_expected_bytes(wanted: str, expected: Slice) -> None:
     assert decide({"range": wanted}, size=100, etag=TAG) == expected
 
 
@@ -63,10 +63,10 @@ def test_a_range_equals_a_python_slice(first: int, last: int, size: int) -> None
         ({"range": "bytes=1-2", "if-none-match": TAG}, 304),
     ],
 )
-def test_preconditions_come_before_the_range(headers: dict[str, str], status: int) -> None:
+def test_preconditions_take_precedence_over_the_range(headers: dict[str, str], status: int) -> None:
     assert decide(headers, size=10, etag=TAG).status == status
 
 
-def test_an_empty_file_has_no_part() -> None:
+def test_a_range_of_an_empty_file_is_not_satisfiable() -> None:
     assert decide({"range": "bytes=0-"}, size=0, etag=TAG).status == 416
     assert decide({}, size=0, etag=TAG) == Slice(200, 0, 0)

@@ -1,4 +1,4 @@
-"""Downloads are redirected to S3 by signed URLs; whoever cannot follow them gets the file from the service."""
+"""Downloads redirect to presigned S3 URLs; clients that cannot follow them get the file from the service."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def finished(running: Running, http: httpx.Client) -> str:
 
 
 @pytest.mark.s3
-def test_a_client_that_accepts_it_is_sent_to_s3(on_s3: Running) -> None:
+def test_downloads_redirect_to_s3_if_the_client_opts_in(on_s3: Running) -> None:
     with on_s3.client() as http:
         path = f"/v1/jobs/{finished(on_s3, http)}/artifacts/shapes.npz"
         answer = http.get(path, params={"redirect": "true"})
@@ -60,7 +60,7 @@ def test_a_client_that_accepts_it_is_sent_to_s3(on_s3: Running) -> None:
 
 
 @pytest.mark.s3
-def test_the_sdk_follows_without_its_token_and_resumes(on_s3: Running, tmp_path: Path) -> None:
+def test_the_sdk_resumes_from_s3_without_sending_credentials(on_s3: Running, tmp_path: Path) -> None:
     seen: list[httpx.Request] = []
     _, token = on_s3.tokens.create("sdk", scopes=(Scope.READ, Scope.SUBMIT))
     with (
@@ -80,7 +80,7 @@ def test_the_sdk_follows_without_its_token_and_resumes(on_s3: Running, tmp_path:
 
 @pytest.mark.s3
 @pytest.mark.parametrize("link", ["unreachable", "refused"])
-def test_the_sdk_falls_back_to_the_service(
+def test_the_sdk_downloads_from_the_service_if_the_redirect_fails(
     on_s3: Running, link: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wrong = f"http://127.0.0.1:{free_port()}/x" if link == "unreachable" else f"{on_s3.url}/healthz/nothing"
@@ -105,7 +105,7 @@ def test_redirects_can_be_turned_off(serve: Serve, s3_url: str) -> None:
     assert (answer.status_code, answer.content) == (200, CONTENT)
 
 
-def test_a_directory_has_no_links(running: Running, http: httpx.Client) -> None:
+def test_directory_and_memory_stores_never_redirect(running: Running, http: httpx.Client) -> None:
     answer = http.get(f"/v1/jobs/{finished(running, http)}/artifacts/shapes.npz", params={"redirect": "true"})
     assert (answer.status_code, answer.content) == (200, CONTENT)
     assert Blobs.open("memory:///").link("k", seconds=1) is None

@@ -44,7 +44,7 @@ def test_an_idle_stream_sends_comment_lines(restless: Running) -> None:
         assert 0.6 < time.monotonic() - begun < 5
 
 
-def test_between_followers_the_service_answers_others() -> None:
+def test_followers_are_woken_in_batches_so_other_requests_can_run() -> None:
     async def turns() -> list[int]:
         watcher, woken = _Watcher(), [0]
 
@@ -70,12 +70,12 @@ def test_between_followers_the_service_answers_others() -> None:
     assert max(after - before for before, after in pairwise([0, *seen])) <= WOKEN_AT_ONCE
 
 
-def test_a_job_that_ends_between_two_reads_is_followed_to_its_end(running: Running, http: httpx.Client) -> None:
+def test_a_job_that_ends_between_reads_still_yields_its_final_event(running: Running, http: httpx.Client) -> None:
     job = submit(http, name="ends")
     seen = running.jobs.events(job.id)[-1].id
 
     class Ending:
-        """Jobs of which this one ends after its events were read."""
+        """Finishes the job right after its events were read."""
 
         records, get = running.jobs.records, staticmethod(running.jobs.get)
 
@@ -94,19 +94,19 @@ def test_a_job_that_ends_between_two_reads_is_followed_to_its_end(running: Runni
     assert is_final(last)
 
 
-def test_a_client_that_disconnects_is_forgotten(restless: Running) -> None:
+def test_followers_are_removed_when_their_client_disconnects(restless: Running) -> None:
     service = restless.app.state.service
     with httpx.Client(base_url=restless.url, timeout=10) as http:
         job = submit(http, name="left")
         with http.stream("GET", f"/v1/jobs/{job.id}/events") as answer:
-            lines = answer.iter_lines()  # kept: an iterator that is dropped closes the connection
+            lines = answer.iter_lines()  # keep a reference: a discarded iterator closes the connection
             next(lines)
             until(lambda: service.followers.watched == 1)
         until(lambda: service.followers.watched == 0)
 
 
 @pytest.mark.parametrize("how", ["revoked", "expired"])
-def test_a_stream_ends_when_its_token_does(serve: Serve, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_revoked_or_expired_tokens_end_their_streams(serve: Serve, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     running = serve(auth="required", heartbeat_seconds=0.2)
     token, text = running.tokens.create("listener", expires=timedelta(hours=1) if how == "expired" else None)
     with httpx.Client(base_url=running.url, timeout=10, headers={"Authorization": f"Bearer {text}"}) as http:
@@ -127,7 +127,7 @@ def test_a_stream_ends_when_its_token_does(serve: Serve, how: str, monkeypatch: 
 
 
 @pytest.mark.parametrize("verb", ["POST", "PUT"])
-def test_a_submission_can_wait_for_the_end(running: Running, http: httpx.Client, verb: str) -> None:
+def test_a_submission_can_wait_for_the_job_to_finish(running: Running, http: httpx.Client, verb: str) -> None:
     path = "/v1/jobs" if verb == "POST" else "/v1/jobs/awaited-at-once"
     body = form(tracks(seed=7), name=f"awaited {verb}")
     begun = time.monotonic()
@@ -144,7 +144,7 @@ def test_a_submission_can_wait_for_the_end(running: Running, http: httpx.Client,
 
 
 @pytest.mark.parametrize("verb", ["POST", "PUT"])
-def test_a_submission_whose_wait_fails_is_accepted_all_the_same(
+def test_a_submission_is_accepted_even_if_its_wait_fails(
     running: Running, http: httpx.Client, verb: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def away(*_: object, **__: object) -> list[object]:
@@ -159,7 +159,7 @@ def test_a_submission_whose_wait_fails_is_accepted_all_the_same(
 
 
 @pytest.mark.parametrize("wish", ["wait", "wait=", "wait=x", "wait=-9", "return=minimal", "wait=9.5", "wait=٩"])
-def test_an_invalid_preference_is_ignored(http: httpx.Client, wish: str) -> None:
+def test_an_invalid_prefer_header_is_ignored(http: httpx.Client, wish: str) -> None:
     job = submit(http)
     begun = time.monotonic()
     answer = http.get(f"/v1/jobs/{job.id}", headers={b"Prefer": wish.encode()})
@@ -178,7 +178,7 @@ def test_a_wait_is_capped_by_the_service(serve: Serve) -> None:
         assert time.monotonic() - begun < 5
 
 
-def test_resuming_a_finished_job_at_its_last_event_ends(running: Running, http: httpx.Client) -> None:
+def test_resuming_after_the_final_event_returns_no_events(running: Running, http: httpx.Client) -> None:
     job = submit(http, name="resumed at the end")
     finish(running, job.id, b"x")
     address = f"/v1/jobs/{job.id}/events"
@@ -188,13 +188,13 @@ def test_resuming_a_finished_job_at_its_last_event_ends(running: Running, http: 
 
 
 @pytest.mark.parametrize("id", ["99999999999999999999-0", "0-18446744073709551616", "x", "1-"])
-def test_an_impossible_event_id_is_refused(http: httpx.Client, id: str) -> None:
+def test_an_invalid_event_id_is_rejected(http: httpx.Client, id: str) -> None:
     job = submit(http, name="impossible")
     answer = http.get(f"/v1/jobs/{job.id}/events", headers={"Last-Event-ID": id}, timeout=5)
     assert (answer.status_code, answer.json()["code"]) == (422, "invalid_event_id")
 
 
-def test_the_log_has_the_lines_of_all_attempts(running: Running, http: httpx.Client) -> None:
+def test_the_log_is_returned_as_plain_text(running: Running, http: httpx.Client) -> None:
     job = submit(http, name="logged")
     empty = http.get(f"/v1/jobs/{job.id}/log")
     assert (empty.status_code, empty.text) == (200, "")
@@ -211,7 +211,7 @@ def test_the_log_has_the_lines_of_all_attempts(running: Running, http: httpx.Cli
 def process(
     valkey_url: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> Iterator[tuple[subprocess.Popen[bytes], str, Path]]:
-    """The service as a process of its own, as `pliant up` starts it; or begun as the test asks."""
+    """The service in its own process, started as `pliant up` does or with the arguments of the test."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -242,7 +242,7 @@ def process(
     started.wait(10)
 
 
-def test_sigterm_ends_streams_and_waits_at_once_and_cleanly(
+def test_sigterm_ends_streams_and_waits_promptly_and_cleanly(
     process: tuple[subprocess.Popen[bytes], str, Path],
 ) -> None:
     service, url, log = process
@@ -262,7 +262,7 @@ def test_sigterm_ends_streams_and_waits_at_once_and_cleanly(
         threads = [threading.Thread(target=each) for each in (listen, wait)]
         for thread in threads:
             thread.start()
-        until(lambda: "pliant_http_under_way 3" in http.get("/metrics").text)  # both, and the one that asks
+        until(lambda: "pliant_http_under_way 3" in http.get("/metrics").text)  # the stream, the wait and this request
         stopped = time.monotonic()
         service.send_signal(signal.SIGTERM)
         assert service.wait(20) == 0

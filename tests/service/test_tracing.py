@@ -1,4 +1,4 @@
-"""A trace goes from the request through the queue into the stages of the solver; without tracing nothing of it is loaded."""
+"""A trace covers the request, the queue and the solver stages; with tracing off, OpenTelemetry is not imported."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ INCOMING = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
 
 @pytest.fixture
 def spans(monkeypatch: pytest.MonkeyPatch) -> Iterator[InMemorySpanExporter]:
-    """Keep the spans of this process, whatever the settings say."""
+    """Collect the spans of this process, whatever the settings."""
     exporter, provider = InMemorySpanExporter(), TracerProvider()
     provider.add_span_processor(SimpleSpanProcessor(exporter))
     monkeypatch.setattr(tracing, "configure", lambda *_, **__: None)
@@ -37,7 +37,7 @@ def named(exporter: InMemorySpanExporter) -> dict[str, ReadableSpan]:
     return {each.name: each for each in exporter.get_finished_spans()}
 
 
-def test_one_trace_from_the_request_to_the_stages(
+def test_request_queue_and_solver_stages_share_one_trace(
     running: Running, http: httpx.Client, spans: InMemorySpanExporter
 ) -> None:
     sequence = face(4, 60)
@@ -81,7 +81,7 @@ def test_without_tracing_a_job_has_no_trace(running: Running, http: httpx.Client
         assert current is None
 
 
-def test_the_extra_is_named_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_opentelemetry_names_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("opentelemetry.sdk.resources", "opentelemetry.sdk.trace", "opentelemetry.sdk.trace.export"):
         monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(InvalidSetting, match=r"pliant\[otel\]"):
@@ -89,7 +89,7 @@ def test_the_extra_is_named_where_it_is_missing(monkeypatch: pytest.MonkeyPatch)
     tracing.configure("off", service="test")
 
 
-def test_what_is_written_to_the_console_is_a_span() -> None:
+def test_console_spans_are_printed_even_if_stdout_is_redirected() -> None:
     script = (
         "from pliant.worker import tracing\n"
         "tracing.configure('console', service='test')\n"
@@ -102,7 +102,7 @@ def test_what_is_written_to_the_console_is_a_span() -> None:
     assert '"pliant.answer": 42' in ran.stdout
 
 
-def test_off_it_loads_nothing() -> None:
+def test_opentelemetry_is_not_imported_if_tracing_is_off() -> None:
     script = (
         "import sys\nfrom pliant.worker import tracing\ntracing.configure('off', service='test')\n"
         "with tracing.span('nothing'):\n    tracing.Stages().enter('cameras')\n"

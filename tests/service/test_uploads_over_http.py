@@ -1,4 +1,4 @@
-"""Large inputs over real HTTP: sent whole, in parts, over broken connections; named by jobs; refused with both sides."""
+"""Large inputs over real HTTP: sent whole, in parts or over broken connections; used by jobs; rejected."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def repr_digest(data: bytes) -> str:
 
 
 def begun(url: str, path: str, *, declared: int, sent: bytes, headers: str = "") -> socket.socket:
-    """Begin a PUT and leave it open."""
+    """Start a PUT and leave it open."""
     host, port = url.removeprefix("http://").split(":")
     connection = socket.create_connection((host, int(port)), timeout=10)
     head = f"PUT {path} HTTP/1.1\r\nHost: {host}\r\nContent-Length: {declared}\r\n{headers}\r\n"
@@ -57,7 +57,7 @@ def test_one_put_is_a_complete_upload(http: httpx.Client) -> None:
 
 
 @pytest.mark.parametrize("verb", ["PATCH", "PUT"])
-def test_an_upload_in_several_requests(http: httpx.Client, verb: str) -> None:
+def test_an_upload_can_span_several_requests(http: httpx.Client, verb: str) -> None:
     path = f"/v1/uploads/parts-{verb}"
     first = http.put(path, content=DATA[:1_000_000], headers={"Upload-Complete": "?0", "Upload-Length": str(len(DATA))})
     assert (first.status_code, first.json()["complete"], first.headers["upload-complete"]) == (201, False, "?0")
@@ -100,7 +100,7 @@ def test_a_reconnecting_client_replaces_its_dead_connection(running: Running, ht
         heard(dead, b'"upload_taken_over"')
 
 
-def test_repeating_a_put_after_a_lost_answer_is_safe(running: Running, http: httpx.Client) -> None:
+def test_repeating_a_put_after_a_lost_response_is_safe(running: Running, http: httpx.Client) -> None:
     digest = {"Repr-Digest": repr_digest(DATA)}
     assert http.put("/v1/uploads/again", content=DATA, headers=digest).status_code == 201
     assert http.put("/v1/uploads/again", content=DATA, headers=digest).status_code == 200
@@ -154,7 +154,7 @@ def test_rejected_uploads_state_the_reason(small: Running, case: str) -> None:
     assert there.status_code == 404 or there.json()["complete"] is False
 
 
-def test_a_body_without_a_length_is_held_to_the_limit_too(small: Running) -> None:
+def test_a_body_of_unknown_length_is_limited_too(small: Running) -> None:
     answer = httpx.put(f"{small.url}/v1/uploads/endless", content=iter([b"x" * 50_000] * 10))
     assert (answer.status_code, answer.json()["code"]) == (413, "upload_too_large")
     assert httpx.put(f"{small.url}/v1/uploads/x", content=b"").json()["code"] == "invalid_id"
@@ -168,7 +168,7 @@ def test_a_stalled_upload_ends_and_its_bytes_are_kept(serve: Serve) -> None:
     assert (there["complete"], there["length"]) == (False, 90_000)
 
 
-def test_a_job_can_name_uploads_instead_of_parts(running: Running, http: httpx.Client) -> None:
+def test_a_job_can_use_uploads_instead_of_form_parts(running: Running, http: httpx.Client) -> None:
     sent = tracks(6, 12)
     truth = npz(shapes=np.random.default_rng(1).normal(size=(6, 12, 3)))
     http.put("/v1/uploads/tracks-1", content=sent)
@@ -181,7 +181,7 @@ def test_a_job_can_name_uploads_instead_of_parts(running: Running, http: httpx.C
     assert answer.status_code == 202, answer.text
     job = Job.model_validate_json(answer.content)
     assert (job.interpretation.num_points, job.interpretation.has_ground_truth) == (12, True)
-    # The same content is the same request, whether it came as parts or as uploads; nor does the job need them any more.
+    # The same content sent as parts or as uploads is the same request, and the job no longer needs the uploads.
     for id in ("tracks-1", "truth-1"):
         assert http.delete(f"/v1/uploads/{id}").status_code == 204
     carried = http.post("/v1/jobs", files=form(sent, mesh="3x4", ground_truth=truth), headers=key)
@@ -202,7 +202,7 @@ def test_a_missing_upload_or_a_duplicate_part_is_rejected(running: Running, http
     assert running.waiting == before
 
 
-def test_a_quota_counts_uploads(serve: Serve) -> None:
+def test_uploads_count_toward_the_quota(serve: Serve) -> None:
     full = serve(quota=150_000)
     with httpx.Client(base_url=full.url) as http:
         assert http.put("/v1/uploads/first", content=b"x" * 100_000).status_code == 201
@@ -226,7 +226,7 @@ def test_too_many_uploads_are_refused(serve: Serve, monkeypatch: pytest.MonkeyPa
     assert answers[-1].json()["code"] == "too_many_uploads"
 
 
-def test_uploads_of_another_token_do_not_exist(serve: Serve) -> None:
+def test_uploads_of_another_token_are_invisible(serve: Serve) -> None:
     running = serve(auth="required")
     assert httpx.put(f"{running.url}/v1/uploads/mine", content=b"x").status_code == 401
     with running.client() as ada, running.client() as bob:

@@ -1,4 +1,4 @@
-// What can be done with a finished job: further files of its result, a link to show it, its inputs with other options.
+// Next steps for a finished job: more files of its result, a share link, and another run with other options.
 
 import { Refusal, createShare, getJob, listShares, makeOutputs, revokeShare } from "./api";
 import { button, h, uniqueId } from "./dom";
@@ -12,14 +12,14 @@ const KINDS: [string, string][] = [
   ["usd", "USD"],
   ["abc", "Alembic"],
   ["mdd", "MDD point cache"],
-  ["ply", "PLY, one a frame"],
-  ["obj", "OBJ, one a frame"],
+  ["ply", "PLY, one per frame"],
+  ["obj", "OBJ, one per frame"],
   ["mat", "MATLAB"],
-  ["csv", "Tables of errors (csv)"],
+  ["csv", "Error tables (csv)"],
 ];
 const DAY = 24 * 3600;
 
-/** Tells the form to use a job's inputs again; `main.ts` listens. */
+/** Event that makes the form reuse a job's inputs; `main.ts` handles it. */
 export const AGAIN = "pliant-again";
 
 export class Afterwards {
@@ -53,7 +53,7 @@ function trouble(place: HTMLElement, error: unknown): void {
   place.replaceChildren(refusalBox(error.problem));
 }
 
-/** The form that asks for further files, and the files once they are there. */
+/** The form that requests more files, and the files once they exist. */
 function furtherFiles(job: Job): HTMLElement {
   const boxes = KINDS.map(([kind, words]) => {
     const id = uniqueId("kind");
@@ -65,11 +65,11 @@ function furtherFiles(job: Job): HTMLElement {
     "select",
     { id: uniqueId("axes") },
     h("option", { value: "viewer" }, "y up, as in viewers"),
-    h("option", { value: "tracks" }, "as the tracks"),
+    h("option", { value: "tracks" }, "as in the tracks"),
   );
   axes.value = String(job.options["axes"]);
   const words = h("div", { class: "answer", role: "status" });
-  const make = h("button", { type: "submit", class: "primary" }, "Make the files");
+  const make = h("button", { type: "submit", class: "primary" }, "Create the files");
   const form = h(
     "form",
     { class: "after-form" },
@@ -91,7 +91,7 @@ function furtherFiles(job: Job): HTMLElement {
   return form;
 }
 
-/** Ask for the files and follow the job that writes them; nothing is solved again. */
+/** Request the files and follow the job that writes them, without solving again. */
 async function write(job: Job, wanted: Record<string, unknown>, words: HTMLElement): Promise<void> {
   try {
     let further = await makeOutputs(job.id, wanted);
@@ -108,7 +108,7 @@ async function write(job: Job, wanted: Record<string, unknown>, words: HTMLEleme
   }
 }
 
-/** The form that makes a link, and the links that are valid. */
+/** The form that creates a link, and the list of valid links. */
 function sharing(job: Job): HTMLElement {
   const days = h("select", { id: uniqueId("days") }, ...[1, 7, 30, 366].map((each) => h("option", { value: each }, count(each, "day"))));
   days.value = "7";
@@ -118,7 +118,7 @@ function sharing(job: Job): HTMLElement {
   const form = h(
     "form",
     { class: "after-form" },
-    h("p", { class: "hint" }, "Whoever has the link sees this result and its files, and nothing else. It can be revoked at any time."),
+    h("p", { class: "hint" }, "Anyone with the link can view this result and its files, but nothing else. You can revoke it at any time."),
     h("div", { class: "row" }, h("label", { for: days.id }, "Valid for"), days, create),
     made,
     valid,
@@ -141,7 +141,7 @@ function sharing(job: Job): HTMLElement {
       .then(async (share) => {
         const link = new URL(share.path ?? "", location.href.split("#")[0]).href;
         const field = h("input", { type: "text", readonly: true, value: link, "aria-label": "Link to this result", onfocus: () => field.select() });
-        made.replaceChildren(field, h("p", { class: "hint" }, "Copy it now: it is shown only once."));
+        made.replaceChildren(field, h("p", { class: "hint" }, "Copy the link now: it is shown only once."));
         field.focus();
         await list();
       })

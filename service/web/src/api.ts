@@ -1,8 +1,8 @@
-// Every call to the service. Addresses are relative, so the page also works behind a proxy that adds a path.
+// All calls to the service. URLs are relative, so that the page also works behind a proxy that adds a path.
 
 import type { Inspection, Job, JobPage, Problem, Schema, Share } from "./types";
 
-/** The service said no, or did not answer: `problem.detail` is the sentence to show. */
+/** The service refused a request or did not answer: `problem.detail` is the message to show. */
 export class Refusal extends Error {
   constructor(readonly problem: Problem) {
     super(problem.detail);
@@ -11,38 +11,38 @@ export class Refusal extends Error {
 
 const TOKEN = "pliant-token";
 
-/** Ask with this Bearer token from now on; kept until the tab is closed. */
+/** Send this bearer token with every request; it is kept until the tab is closed. */
 export function setToken(token: string): void {
   if (token) sessionStorage.setItem(TOKEN, token);
   else sessionStorage.removeItem(TOKEN);
 }
 
-/** Whether a token is kept. */
+/** Whether a token is set. */
 export function hasToken(): boolean {
   return sessionStorage.getItem(TOKEN) !== null;
 }
 
-/** The token of the share link that this page was opened with: it goes before a token of one's own. */
+/** The token of the share link that this page was opened with; it takes precedence over a stored token. */
 let share: string | null = null;
 
-/** Read through a share link from now on. */
+/** Send the token of a share link with every request. */
 export function setShare(token: string): void {
   share = token;
 }
 
 let single = false;
 
-/** Show one result from now on: of a share link, or of a folder on this computer. */
+/** Show a single result: that of a share link, or of a folder on this computer. */
 export function setSingle(): void {
   single = true;
 }
 
-/** Whether the page shows one result, and there are no others to list. */
+/** Whether the page shows a single result, without a job list. */
 export function isSingle(): boolean {
   return single;
 }
 
-/** Whether the page reads through a share link. */
+/** Whether the page was opened with a share link. */
 export function isShared(): boolean {
   return share !== null;
 }
@@ -56,13 +56,13 @@ function unreachable(): Refusal {
   return new Refusal({
     title: "No answer",
     status: 0,
-    detail: "The service does not answer. Check that it is running; this page reconnects by itself.",
+    detail: "The service does not answer. Check that it is running; this page reconnects automatically.",
     code: "unreachable",
     retryable: true,
   });
 }
 
-/** Read problem+json, or make a problem of an answer that is not. */
+/** Parse problem+json, or describe a response in another format as a problem. */
 function problemOf(status: number, text: string): Problem {
   try {
     const given = JSON.parse(text) as Partial<Problem>;
@@ -75,7 +75,7 @@ function problemOf(status: number, text: string): Problem {
   return {
     title: "Refused",
     status,
-    detail: `The service answered with status ${status} and no explanation. Its log has the details.`,
+    detail: `The service answered with status ${status} and no explanation. See its log for details.`,
     code: "unknown",
   };
 }
@@ -108,7 +108,7 @@ const posted = (body: unknown): RequestInit => ({
   headers: { "Content-Type": "application/json" },
   body: JSON.stringify(body),
 });
-/** Have further files written of a result; the answer is the job that writes them. */
+/** Request more files of a result; return the job that writes them. */
 export const makeOutputs = (id: string, wanted: Record<string, unknown>): Promise<Job> => json(`${at(id)}/outputs`, posted(wanted));
 export const createShare = (id: string, seconds: number): Promise<Share> => json(`${at(id)}/shares`, posted({ expires_in: seconds }));
 export const listShares = (id: string): Promise<Share[]> => json(`${at(id)}/shares`);
@@ -119,13 +119,13 @@ export const deleteJob = async (id: string): Promise<void> => {
   await call(at(id), { method: "DELETE" });
 };
 
-/** Ask how files would be understood; no job is made of them. */
+/** Return how the service interprets files, without creating a job. */
 export const inspect = (form: FormData, signal: AbortSignal): Promise<Inspection> =>
   json("v1/inspect", { method: "POST", body: form, signal });
 
 let options: Promise<Schema> | null = null;
 
-/** The options' schema, asked for once. */
+/** Return the schema of the options; it is fetched once. */
 export function getOptions(): Promise<Schema> {
   options ??= json<Schema>("v1/options").catch((error: unknown) => {
     options = null;
@@ -141,7 +141,7 @@ export interface Example {
   name: string;
   title: string;
   files: { part: string; file: string }[];
-  /** What to track in a film: corners in its first frame. */
+  /** Region to track in a film: corners in its first frame. */
   region_polygon?: [number, number][] | null;
 }
 export const listExamples = (): Promise<{ examples: Example[] }> => json("v1/examples");
@@ -151,12 +151,12 @@ export async function exampleFile(name: string, file: string): Promise<File> {
   return new File([await answer.blob()], file);
 }
 
-/** A key by which the service knows a repeated submission for what it is. */
+/** A new idempotency key, by which the service recognises a repeated submission. */
 export function newKey(): string {
   return Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
 }
 
-/** Send a new job. XMLHttpRequest, because fetch cannot say how much of a body has gone out. */
+/** Submit a new job. Uses XMLHttpRequest, because fetch does not report upload progress. */
 export function submit(form: FormData, key: string, onSent: (fraction: number) => void, signal: AbortSignal): Promise<Job> {
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();

@@ -1,10 +1,10 @@
-// Recording a film from the camera, where the browser offers one.
+// Recording a film with the camera, if the browser provides one.
 
 import { button, h, say, uniqueId } from "./dom";
 
-/** A recording ends by itself after this long, seconds: enough for a slow turn, and tracked within a minute or two. */
+/** Maximum length of a recording in seconds: enough for a slow turn, and tracked within a minute or two. */
 const LONGEST = 20;
-/** The recorder hands over what it has this often, milliseconds. */
+/** Interval at which the recorder delivers data, milliseconds. */
 const PIECE = 250;
 const FORMATS: [type: string, name: string][] = [
   ["video/mp4;codecs=avc1.640028", "recording.mp4"],
@@ -13,13 +13,13 @@ const FORMATS: [type: string, name: string][] = [
   ["video/mp4", "recording.mp4"],
 ];
 
-/** True where this page may ask for a camera: a secure address, and a browser that records. */
+/** True if this page may request a camera: the address is secure, and the browser supports recording. */
 export function canRecord(): boolean {
   return isSecureContext && typeof MediaRecorder !== "undefined" && Boolean(navigator.mediaDevices?.getUserMedia);
 }
 
 export class CameraDialog {
-  private readonly video = h("video", { playsinline: true, "aria-label": "The camera's picture" });
+  private readonly video = h("video", { playsinline: true, "aria-label": "Camera preview" });
   private readonly words = h("p", { role: "status" });
   private readonly start = button("Record", () => this.record(), { class: "primary", disabled: true });
   private readonly stop = button("Stop", () => this.recorder?.stop(), { class: "primary", hidden: true, disabled: true });
@@ -45,7 +45,7 @@ export class CameraDialog {
     this.dialog.addEventListener("close", () => this.close());
   }
 
-  /** Show the dialog and ask for the camera. */
+  /** Show the dialog and request the camera. */
   async open(): Promise<void> {
     document.body.append(this.dialog);
     this.dialog.showModal();
@@ -56,7 +56,7 @@ export class CameraDialog {
       if (this.closed) return this.release();
       this.video.srcObject = stream;
       await this.video.play();
-      say(this.words, `At most ${LONGEST} seconds are recorded.`);
+      say(this.words, `Recording stops after ${LONGEST} seconds.`);
       this.start.disabled = false;
       this.start.focus();
     } catch (error) {
@@ -73,14 +73,14 @@ export class CameraDialog {
     recorder.addEventListener("dataavailable", ({ data }) => {
       if (data.size === 0) return;
       parts.push(data);
-      // A slow encoder needs a while for its first frame; a recording without one is no film.
+      // A slow encoder takes a while for its first frame; a recording without a frame is not a film.
       if (!this.stop.disabled) return;
       this.stop.disabled = false;
       this.stop.focus();
     });
     recorder.addEventListener("stop", () => {
       if (this.closed) return;
-      if (parts.length === 0) return say(this.words, "The camera sent no picture. Cancel, check the camera and record again.");
+      if (parts.length === 0) return say(this.words, "The camera delivered no picture. Cancel, check the camera and record again.");
       this.dialog.close();
       this.onFilm(new File(parts, name, { type: type.split(";")[0] as string }));
     });

@@ -1,4 +1,4 @@
-// The form for a new job: files, how they are understood, options, and the service's answer if it says no.
+// The form for a new job: files, their interpretation, options, and errors.
 
 import { type Example, Refusal, exampleFile, getOptions, listExamples, newKey, submit } from "./api";
 import { button, h } from "./dom";
@@ -25,13 +25,13 @@ export class Compose {
   private readonly answer = h("div", { class: "answer", "aria-live": "assertive" });
   private readonly examples = h("p", { class: "examples" });
   private sending: AbortController | null = null;
-  /** Kept while it is unknown whether the service has got the job: sending again must not make a second one. */
+  /** The idempotency key, kept while it is unknown whether the service received the job: a retry must not create a second one. */
   private key: string | null = null;
   private offered: Example[] = [];
-  /** The job whose inputs are used again; null: the files in the form. */
+  /** The job whose inputs are reused; null: the files in the form. */
   private kept: Job | null = null;
   private readonly keeping = h("div", { class: "keeping", hidden: true });
-  /** What the name was filled in with; a name that a person typed stays. */
+  /** The automatically filled-in name; a name typed by the user is not overwritten. */
   private filledIn = "";
 
   constructor(private readonly onJob: (job: Job) => void) {
@@ -53,7 +53,7 @@ export class Compose {
     document.addEventListener("drop", () => (this.element.open = true));
   }
 
-  /** Other files, or other options of reading them. */
+  /** The files, or the options for reading them, have changed. */
   private changed(): void {
     this.key = null;
     const stem = this.slots.main?.name.replace(/\.[^.]*$/, "").slice(0, 200) ?? "";
@@ -62,7 +62,7 @@ export class Compose {
     if (!this.sending) this.inspection.changed();
   }
 
-  /** Examples are for those who have no files yet; what the files were read as takes their place. */
+  /** Offer examples until files are chosen; the interpretation of the files then takes their place. */
   private offerExamples(): void {
     this.examples.hidden = this.kept !== null || this.slots.main !== null;
   }
@@ -91,7 +91,7 @@ export class Compose {
     return ["No files at hand? Try the example ", ...buttons, "."];
   }
 
-  /** Fill the form with the options of a job, to run its inputs again with others. */
+  /** Fill the form with the options of a job, to run its inputs again with different ones. */
   again(job: Job): void {
     this.keep(job);
     this.options.fill(job.options);
@@ -112,18 +112,18 @@ export class Compose {
     if (job === null) this.keeping.replaceChildren();
     else {
       const other = button("Use other files", () => this.keep(null), { class: "link" });
-      this.keeping.replaceChildren(h("p", {}, `The inputs of “${title(job)}” are used again. Change the options below. `, other));
+      this.keeping.replaceChildren(h("p", {}, `This job reuses the inputs of “${title(job)}”. Change the options below. `, other));
     }
   }
 
-  /** Remove what was refused. */
+  /** Remove all error messages. */
   private clear(): void {
     this.answer.replaceChildren();
     this.slots.clear();
     this.options.clear();
   }
 
-  /** Take the first example, or the first film, and send it: the shortest way to a moving mesh. */
+  /** Submit the first example of this kind: the shortest way to a moving mesh. */
   async tryOut(kind: "tracks" | "film"): Promise<void> {
     const example = this.offered.find(({ files }) => files.some(({ part }) => part === kind));
     if (example === undefined) return;
@@ -132,7 +132,7 @@ export class Compose {
     if (this.slots.file(kind)) this.send.form?.requestSubmit();
   }
 
-  /** True where the service makes an example of tracks, or of a film. */
+  /** True if the service has an example of this kind. */
   hasExample(kind: "tracks" | "film"): boolean {
     return this.offered.some(({ files }) => files.some(({ part }) => part === kind));
   }
@@ -218,7 +218,7 @@ export class Compose {
     this.stop.hidden = !busy;
   }
 
-  /** Show why not; `again` is called when one of several readings has been chosen. */
+  /** Show an error; `again` is called when the user has chosen one of several interpretations. */
   private refuse(error: unknown, again = (): void => this.send.form?.requestSubmit()): void {
     if (error instanceof DOMException && error.name === "AbortError") {
       this.answer.replaceChildren(h("p", { class: "muted" }, "Stopped. Nothing was submitted."));
@@ -231,7 +231,7 @@ export class Compose {
       const [part = "", option = ""] = (error.problem.field ?? "").split(".");
       const placed = refusalBox(error.problem, choose, true);
       const shown = part === "options" ? this.options.refuse(option, placed) : !this.kept && this.slots.refuse(part, placed);
-      this.answer.replaceChildren(shown ? h("p", { class: "sentence bad" }, `Not sent: see “${placeOf(part, option)}” above.`) : refusalBox(error.problem, choose));
+      this.answer.replaceChildren(shown ? h("p", { class: "sentence bad" }, `Not submitted: see “${placeOf(part, option)}” above.`) : refusalBox(error.problem, choose));
     } else throw error;
   }
 }

@@ -1,4 +1,4 @@
-// The time that is left, counted down between two messages of the service.
+// The remaining time, counted down between two messages of the service.
 
 import type { Job } from "./types";
 
@@ -9,10 +9,10 @@ export class Countdown {
   private job: Job | null = null;
   private heard = 0;
 
-  /** `onTick` gets the record with the seconds that are left now. */
+  /** `onTick` gets the record with the current remaining time. */
   constructor(private readonly onTick: (job: Job) => void) {}
 
-  /** Take a record; messages without another time of progress do not start the count anew. */
+  /** Update the record; the countdown restarts only if the progress has a new timestamp. */
   show(job: Job): void {
     if (job.progress?.updated_at !== this.job?.progress?.updated_at) this.heard = performance.now();
     this.job = job;

@@ -1,4 +1,4 @@
-// Two small charts: the objective and the residual, reweighting by reweighting, as they come.
+// Two small live charts: the objective and the residual after each reweighting.
 
 import { h, svg } from "./dom";
 import type { Job, Progress } from "./types";
@@ -15,15 +15,15 @@ const HEIGHT = 96;
 export class Curves {
   readonly element = h("div", { class: "curves" });
   private attempt = 0;
-  private readonly objective = new Curve("Objective", "the energy that is minimised");
-  private readonly residual = new Curve("Residual", "median reprojection residual, the tracks' unit");
+  private readonly objective = new Curve("Objective", "the energy being minimised");
+  private readonly residual = new Curve("Residual", "median reprojection residual, in the tracks' unit");
 
   constructor() {
     this.element.append(this.objective.element, this.residual.element);
     this.element.hidden = true;
   }
 
-  /** Take what a running job says now. */
+  /** Add the current progress of a running job. */
   progress(progress: Progress): void {
     if (progress.stage !== "reweight" && progress.stage !== "finish") return;
     if (progress.objective !== null) this.objective.add(progress.reweighting, progress.objective);
@@ -31,7 +31,7 @@ export class Curves {
     this.show();
   }
 
-  /** Take the whole trace of a finished job's report: every number the page may have missed. */
+  /** Show the complete trace from a finished job's report, including values that the page has missed. */
   report(report: Record<string, unknown>): void {
     const trace = (report["trace"] ?? {}) as Record<string, unknown>;
     this.objective.set(numbers(trace["objective"]));
@@ -39,7 +39,7 @@ export class Curves {
     this.show();
   }
 
-  /** Take what a record says. Another attempt than before begins its own curves. */
+  /** Add the progress in a record. A new attempt starts new curves. */
   job(job: Job): void {
     if (job.attempt !== this.attempt) {
       this.objective.clear();
@@ -82,7 +82,7 @@ class Curve {
     return this.samples.length;
   }
 
-  /** Samples come in any order: first where the job is now, then the past that the event stream tells again. */
+  /** Samples arrive in any order: first the current one, then past ones that the event stream repeats. */
   add(step: number, value: number): void {
     const at = this.samples.findIndex((sample) => sample.step >= step);
     if (at < 0) this.samples.push({ step, value });

@@ -1,4 +1,4 @@
-// One job: where it stands, what it was understood as, and what came of it.
+// One job: its state, the interpretation of its inputs, and its result.
 
 import { Refusal, artifactPath, cancelJob, deleteJob, getReport, isShared, isSingle, listJobs, retryJob } from "./api";
 import { Afterwards } from "./afterwards";
@@ -86,7 +86,7 @@ export class Detail {
     void this.follow();
   }
 
-  /** Stop following and give the graphics card back. */
+  /** Stop following the job and release the graphics card. */
   close(): void {
     this.leaving.abort();
     this.countdown.stop();
@@ -118,14 +118,14 @@ export class Detail {
     await follow(this.id, follower, this.leaving.signal);
   }
 
-  /** A stream of events begins with those of the past: they make the curves whole, but do not turn the clock back. */
+  /** An event stream starts with past events: they complete the curves, but must not reset the progress. */
   private progress(progress: Progress): void {
     this.curves.progress(progress);
     const job = progressed(this.job, progress);
     if (job) this.show(job);
   }
 
-  /** Take in a record that may be older than what is known. */
+  /** Show a record unless it is older than the one shown. */
   learn(job: Job): void {
     const news = newer(this.job, job);
     if (news) this.show(news);
@@ -136,7 +136,7 @@ export class Detail {
     say(this.heading, title(job));
     say(this.status, STATUS_WORDS[job.status]);
     this.status.dataset["status"] = job.status;
-    say(this.when, `${isFinal(job.status) ? "" : "sent "}${ago(job.created_at)}${job.expires_at && !isShared() ? `, kept until ${new Date(job.expires_at).toLocaleDateString()}` : ""}`);
+    say(this.when, `${isFinal(job.status) ? "" : "submitted "}${ago(job.created_at)}${job.expires_at && !isShared() ? `, kept until ${new Date(job.expires_at).toLocaleDateString()}` : ""}`);
     this.countdown.show(job);
     this.tab.show(job);
     this.live.show(job);
@@ -159,7 +159,7 @@ export class Detail {
     if (!isFinal(job.status)) this.finished = false;
   }
 
-  /** Show what a clock changes: the record's progress with the seconds that are left now. */
+  /** Show what changes with time: the progress with the current remaining time. */
   private showProgress(job: Job): void {
     say(this.standing, job.status === "failed" ? "" : standing(job));
     this.figures.show(job);
@@ -236,7 +236,7 @@ export class Detail {
           this.verdict.report(report);
         })
         .catch((error: unknown) => {
-          if (!(error instanceof Refusal)) throw error; // the charts keep what they saw live
+          if (!(error instanceof Refusal)) throw error; // the charts keep their live values
         });
     }
     if (!preview) return;

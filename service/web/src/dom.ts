@@ -1,9 +1,9 @@
-// Building elements without a framework, and without a single string of HTML: text can never become markup.
+// Building elements without a framework and without HTML strings: text can never become markup.
 
 type Child = Node | string | null | undefined | false;
 type Attributes = Record<string, string | number | boolean | ((event: never) => void) | null | undefined>;
 
-/** Make an element. Attributes named on… are listeners; true sets an empty attribute; false and null leave it out. */
+/** Make an element. Attributes named on… are listeners; true sets an empty attribute; false and null omit it. */
 export function h<K extends keyof HTMLElementTagNameMap>(
   tag: K,
   attributes: Attributes = {},
@@ -31,14 +31,14 @@ function decorate(element: Element, attributes: Attributes): void {
   }
 }
 
-/** Replace an element's children, but only if what they say has changed: focus and selection survive an idle update. */
+/** Replace an element's children only if `key` has changed, so that focus and selection survive an update without changes. */
 export function fill(element: Element, key: string, make: () => Child[]): void {
   if (element.getAttribute("data-shows") === key) return;
   element.setAttribute("data-shows", key);
   element.replaceChildren(...make().filter((child): child is Node | string => Boolean(child)));
 }
 
-/** Set text only where it differs, so that screen readers are not told twice. */
+/** Set text only if it differs, so that screen readers do not announce it twice. */
 export function say(element: Element, text: string): void {
   if (element.textContent !== text) element.textContent = text;
 }
@@ -50,7 +50,7 @@ export function button(label: string, onclick: () => void, attributes: Attribute
 
 let made = 0;
 
-/** An id that nothing else on the page has. */
+/** Return an id that is unique on the page. */
 export function uniqueId(stem: string): string {
   made += 1;
   return `${stem}-${made}`;

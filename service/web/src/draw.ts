@@ -1,11 +1,11 @@
-// A dialog with the film's first frame, to draw a region on it: with a mouse, a finger, a pen or the keyboard.
+// A dialog to draw a region on the film's first frame with a mouse, a finger, a pen or the keyboard.
 
 import { button, h, say, uniqueId } from "./dom";
 import { type Point, type Region, type Size, centred, closed, described, moved, paint, polygon, resized, spanned, within } from "./region";
 
 type Tool = "lasso" | "rectangle";
 
-/** The canvas is at least and at most this wide or high, in its own pixels; the stylesheet fits it to the screen. */
+/** Minimum and maximum length of the longest side of the canvas, in its own pixels; the stylesheet fits it to the screen. */
 const SIDES = [800, 1600] as const;
 /** An arrow key moves a region by this share of the picture's longest side. */
 const STEP = 0.01;
@@ -39,7 +39,7 @@ export class RegionDialog {
     this.choose(initial?.kind ?? "lasso");
   }
 
-  /** Show the dialog; it removes itself when it is closed. */
+  /** Show the dialog; it is removed when it is closed. */
   open(): void {
     document.body.append(this.dialog);
     this.dialog.showModal();
@@ -78,7 +78,7 @@ export class RegionDialog {
       "dialog",
       { class: "region", "aria-labelledby": title },
       h("h2", { id: title }, "Draw around the object"),
-      h("p", { class: "hint" }, "Only the points inside are tracked. Draw closely, and leave the background out."),
+      h("p", { class: "hint" }, "Only points inside the region are tracked. Draw close to the object, without background."),
       h("div", { class: "row", role: "group", "aria-label": "Tool" }, this.tools.lasso, this.tools.rectangle, this.undoing),
       this.canvas,
       this.status,
@@ -107,7 +107,7 @@ export class RegionDialog {
 
   private extend(event: PointerEvent): void {
     if (this.stroke === null || !event.isPrimary) return;
-    // A finger moves faster than events come; the browser keeps the places between.
+    // A finger may move faster than events are sent; the browser keeps the positions in between.
     const between = event.getCoalescedEvents?.() ?? [];
     this.stroke.push(...(between.length > 0 ? between : [event]).map((each) => this.at(each)));
     this.show();
@@ -118,7 +118,7 @@ export class RegionDialog {
     const drawn = this.drawn(this.stroke);
     this.stroke = null;
     if (drawn) this.keep(drawn);
-    else this.show("That region is too small. Drag to draw it.");
+    else this.show("The region is too small. Drag to draw a larger one.");
   }
 
   private abandon(): void {
@@ -143,7 +143,7 @@ export class RegionDialog {
     else act?.();
   }
 
-  /** A key that is held down makes one change to undo. */
+  /** A key that is held down counts as one change for undo. */
   private shift([dx, dy]: Point, isResizing: boolean, isRepeated: boolean): void {
     const step = Math.max(1, Math.round(STEP * Math.max(this.size.width, this.size.height)));
     const by: Point = [dx * step, dy * step];

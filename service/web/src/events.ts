@@ -1,6 +1,6 @@
-// Following one job: server-sent events where the service has them, asking again and again where it has not.
+// Following one job: by server-sent events if the service supports them, else by polling.
 //
-// The stream is read with fetch, not EventSource, because EventSource cannot send a Bearer token.
+// The stream is read with fetch, not EventSource, because EventSource cannot send a bearer token.
 
 import { Refusal, call, getJob } from "./api";
 import { type Job, type Progress, isFinal } from "./types";
@@ -8,7 +8,7 @@ import { type Job, type Progress, isFinal } from "./types";
 export interface Follower {
   onJob: (job: Job) => void;
   onProgress: (progress: Progress) => void;
-  /** Null when the service answers again. */
+  /** Called with an error, or with null when the service answers again. */
   onTrouble: (refusal: Refusal | null) => void;
 }
 
@@ -18,7 +18,7 @@ interface Message {
   data: string;
 }
 
-/** Cut a text stream into its messages; comments (heartbeats) and fields that nobody reads are left out. */
+/** Split a text stream into messages; comments (heartbeats) and unused fields are skipped. */
 async function* messages(body: ReadableStream<Uint8Array>): AsyncGenerator<Message> {
   const reader = body.pipeThrough(new TextDecoderStream() as unknown as TransformStream<Uint8Array, string>).getReader();
   let rest = "";
@@ -49,7 +49,7 @@ async function* messages(body: ReadableStream<Uint8Array>): AsyncGenerator<Messa
   }
 }
 
-/** Follow a job until it is final or `signal` fires; every way out of trouble leads back into the loop. */
+/** Follow a job until it is final or `signal` fires; retryable errors do not end the loop. */
 export async function follow(id: string, follower: Follower, signal: AbortSignal): Promise<void> {
   let streams = true;
   let lastId: string | null = null;
@@ -106,7 +106,7 @@ async function listen(
       else if (typeof told.stage === "string") follower.onProgress(told as Progress);
     }
   } catch (error) {
-    // A stream that breaks off is not an answer: the loop asks for the record, and says so if that fails too.
+    // After an interrupted stream, the loop fetches the record and reports an error only if that fails too.
     if (error instanceof DOMException || error instanceof SyntaxError) throw error;
   }
   return last;

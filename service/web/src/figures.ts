@@ -1,4 +1,4 @@
-// The few numbers of a job that people look for first.
+// The key figures of a job.
 
 import { fill, h } from "./dom";
 import { type Job, isFinal } from "./types";
@@ -23,11 +23,11 @@ function figures(job: Job): [string, string][] {
   const { e3d_frame: error, reprojection_median: residual } = job.metrics ?? {};
   if (error !== undefined) rows.push(["3-D error", `${ofSize(error)}, measured against the ground truth`]);
   if (residual !== undefined) rows.push(["Reprojection", inTracksUnit(residual, job)]);
-  if (job.started_at && job.finished_at) rows.push(["Took", duration((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)]);
+  if (job.started_at && job.finished_at) rows.push(["Duration", duration((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)]);
   const { progress } = job;
   if (progress && !isFinal(job.status)) {
     if (progress.residual !== null) rows.push(["Residual", inTracksUnit(progress.residual, job)]);
-    rows.push(["Left", progress.seconds_left === null ? "–" : duration(progress.seconds_left)]);
+    rows.push(["Time left", progress.seconds_left === null ? "–" : duration(progress.seconds_left)]);
   }
   return rows;
 }

@@ -1,4 +1,4 @@
-// A film as a chosen file: how it is recognised, and its first frame as the browser decodes it.
+// Film files: recognising them, and decoding the first frame in the browser.
 
 import { type Entry, listing, unpacked } from "./peek";
 import type { Inspection } from "./types";
@@ -10,29 +10,29 @@ const PICTURES: [RegExp, string][] = [
   [/\.webp$/i, "image/webp"],
   [/\.bmp$/i, "image/bmp"],
 ];
-/** A browser that has not decoded the first frame after this long, milliseconds, is taken not to decode the film. */
+/** Timeout for decoding the first frame, milliseconds; after it, the browser is assumed unable to decode the film. */
 const PATIENCE = 15_000;
 
-/** Return true for a film by its media type or name, and for a zip that holds no arrays. */
+/** Return true for a media type or name of a film, and for a zip without arrays. */
 export function looksLikeFilm(file: File, entries: Entry[]): boolean {
   if (file.type.startsWith("video/") || FILMS.test(file.name)) return true;
   return /\.zip$/i.test(file.name) && entries.length === 0;
 }
 
-/** Return the first frame in the film's own pixels, or null if this browser cannot decode it. */
+/** Return the first frame at the film's resolution, or null if this browser cannot decode it. */
 export async function firstFrame(file: File): Promise<ImageBitmap | null> {
   try {
     if (/\.gif$/i.test(file.name)) return await createImageBitmap(file);
     if (/\.zip$/i.test(file.name)) return await firstPicture(file);
     return await decoded(file);
   } catch (error) {
-    // Not the picture that its name promises, or cut off: the service states what is wrong with it.
+    // The file is truncated or not in the format of its name: the service will report the error.
     if (error instanceof DOMException || error instanceof RangeError || error instanceof TypeError) return null;
     throw error;
   }
 }
 
-/** Return the first frame as the service decoded it, enlarged to the film's own pixels; null if the answer has none. */
+/** Return the first frame as the service decoded it, enlarged to the film's resolution, or null if the response has none. */
 export async function servedFrame({ first_frame, image_size }: Inspection): Promise<ImageBitmap | null> {
   const [width, height] = (image_size ?? "").split("x").map(Number);
   if (!first_frame || !width || !height) return null;

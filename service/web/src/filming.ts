@@ -1,14 +1,14 @@
-// What the form shows of a chosen film: its first frame, the region drawn on it, and what makes a good film.
+// The film section of the form: advice, the first frame, and the region drawn on it.
 
 import { fill, button, h } from "./dom";
 import { RegionDialog } from "./draw";
 import { firstFrame } from "./film";
 import { type Point, type Region, described, paint, polygon } from "./region";
 
-const ADVICE = "Film advice: turn by 30° or more, keep it sharp, and keep the object large in the picture.";
+const ADVICE = "Tip: turn the object by 30° or more, and keep it sharp and large in the picture.";
 const UNDECODED =
-  "This browser cannot show the film. Its first frame appears here once the service has read it; " +
-  "without it no region can be drawn, and the whole picture is tracked.";
+  "This browser cannot decode the film. Its first frame appears here once the service has decoded it. " +
+  "Without a first frame, you cannot draw a region, and the whole picture is tracked.";
 /** Longest side of the small picture, in its own pixels. */
 const SIDE = 640;
 
@@ -27,14 +27,14 @@ export class Filming {
   );
   private film: File | null = null;
   private picture: ImageBitmap | null = null;
-  /** The first frame as the service decoded it, for a film that the browser may still be trying to. */
+  /** The first frame as the service decoded it, while the browser may still be decoding the film. */
   private served: ImageBitmap | null = null;
   private region: Region | null = null;
   /** Whether the browser gave up decoding the film. */
   private undecoded = false;
   private shown: Promise<void> = Promise.resolve();
 
-  /** `onChange` is called when another region has been chosen. */
+  /** `onChange` is called when the region has changed. */
   constructor(private readonly onChange: () => void) {}
 
   /** The option `region_polygon`; null: the whole picture. */
@@ -47,7 +47,7 @@ export class Filming {
     this.shown = this.begin(film);
   }
 
-  /** Choose a region as if it had been drawn, once the film is shown. */
+  /** Set a region as if it had been drawn, once the film is shown. */
   async take(corners: Point[]): Promise<void> {
     await this.shown;
     if (this.film) this.choose({ kind: "lasso", corners });
@@ -77,7 +77,7 @@ export class Filming {
     this.settle(picture);
   }
 
-  /** Show what the browser decoded, else what the service did. */
+  /** Show the frame decoded by the browser, else the one decoded by the service. */
   private settle(decoded: ImageBitmap | null): void {
     this.undecoded = decoded === null;
     this.picture = decoded ?? this.served;

@@ -1,11 +1,11 @@
-// The sample of the tracks that the service sends with its reading, played as dots with their trails: a wrong reading looks wrong.
+// The sample of the tracks that the service sends with its interpretation, played as dots with trails: a wrong interpretation looks wrong.
 
 import { h } from "./dom";
 
 const SIDE = 1000;
 const HIDDEN = -1;
 const TRAIL = 5;
-/** Frames of the sample a second; they are few, so what lies between is mixed. */
+/** Frames of the sample per second; positions in between are interpolated. */
 const PACE = 8;
 
 export class Glimpse {
@@ -32,10 +32,10 @@ export class Glimpse {
 
   private readonly tick = (now: number): void => {
     if (!this.canvas.checkVisibility()) {
-      this.waiting = setTimeout(() => (this.running = requestAnimationFrame(this.tick)), 500); // folded away for the moment
+      this.waiting = setTimeout(() => (this.running = requestAnimationFrame(this.tick)), 500); // the form is collapsed
       return;
     }
-    // There and back: a sequence seldom ends where it began.
+    // Play forwards and backwards: few sequences end where they began.
     const last = this.sample.length - 1;
     const at = last > 0 ? ((now / 1000) * PACE) % (2 * last) : 0;
     this.draw(at > last ? 2 * last - at : at);

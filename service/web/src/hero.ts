@@ -1,5 +1,5 @@
-// The picture of the front page: one waving sheet, point tracks on its left, the moving mesh on its right.
-// It is computed here from a formula and shows what the words say; it is no result of a solve.
+// The animation of the front page: a waving sheet with point tracks on the left and the moving mesh on the right.
+// It is computed from a formula as an illustration and is not the result of a solve.
 
 const [COLUMNS, ROWS] = [40, 20];
 const TRAIL = 7;
@@ -132,7 +132,7 @@ export class Hero {
   }
 }
 
-/** A point of the sheet, u and v in [0, 1], at a time in seconds: turned a little, seen without perspective. */
+/** A point of the sheet, u and v in [0, 1], at a time in seconds: rotated slightly, without perspective. */
 function sheet(u: number, v: number, time: number): Place {
   const [x, y] = [2.1 * (u - 0.5), 1.05 * (v - 0.5)];
   const wave = 0.5 + 0.5 * u;

@@ -1,12 +1,12 @@
-// Links to files of a job, for browsers that must send a token with the request, too.
+// Links to files of a job that also work if the request needs a token.
 
 import { call, headers } from "./api";
 import { h } from "./dom";
 
-/** A link that phones and headsets open in their own viewer (AR Quick Look); null where the browser has none. */
+/** A link that phones and headsets open in AR Quick Look; null if the browser does not support it. */
 export function quickLookLink(path: string, words: string): HTMLAnchorElement | null {
   if (!document.createElement("a").relList.supports("ar")) return null;
-  // Quick Look takes the link over only if it holds a picture and nothing else.
+  // Quick Look handles the link only if it contains a picture and nothing else.
   const link = h("a", { href: path, rel: "ar", class: "button" }, h("img", { src: "page/icon.svg", alt: words, width: 24, height: 24 }));
   link.addEventListener("click", (event) => {
     if (!("Authorization" in headers()) || link.href.startsWith("blob:")) return;
@@ -16,7 +16,7 @@ export function quickLookLink(path: string, words: string): HTMLAnchorElement | 
   return link;
 }
 
-/** Fetch what a link names, then follow it to that copy. */
+/** Fetch the target of a link with the token, then open that copy. */
 async function openWithToken(link: HTMLAnchorElement, path: string): Promise<void> {
   link.href = URL.createObjectURL(await (await call(path)).blob());
   link.click();

@@ -8,7 +8,7 @@ import { type Job, type Progress, isFinal } from "./types";
 import { badge, verdictOf } from "./verdict";
 import { STATUS_WORDS, ago, count, percent, title } from "./words";
 
-/** Running jobs that are followed beside the one that is shown; a browser opens six connections to a host. */
+/** Number of running jobs followed besides the one that is shown; browsers open at most six connections to a host. */
 const FOLLOWED = 2;
 
 interface Row {
@@ -30,9 +30,9 @@ export class JobList {
   private jobs: Job[] = [];
   private next: string | null = null;
   private selected: string | null = null;
-  /** The selected job that the list was scrolled to. */
+  /** The selected job that the list was last scrolled to. */
   private revealed: string | null = null;
-  /** Whether the newest page has arrived; before, the job that is shown may stand alone in the list. */
+  /** Whether the newest page has arrived; until then the list may contain only the job that is shown. */
   private listed = false;
 
   constructor() {
@@ -40,17 +40,17 @@ export class JobList {
     this.element = h("details", { class: "card", open: true }, summary, this.empty, this.items, this.older);
   }
 
-  /** True while a listed job may still change. */
+  /** True while a listed job is not final. */
   get busy(): boolean {
     return this.jobs.some((job) => !isFinal(job.status));
   }
 
-  /** Ask for the newest page and show it; jobs of older pages stay as they are. Returns what was learned. */
+  /** Fetch, show and return the newest page; jobs of older pages stay as they are. */
   async refresh(): Promise<Job[]> {
     const page = await listJobs();
     const fresh = new Set(page.jobs.map((job) => job.id));
     const oldest = page.jobs.at(-1)?.created_at;
-    // Beyond the newest page only what is older than it can still exist unseen; the rest has been deleted.
+    // A job missing from the newest page still exists only if it is older than that page; otherwise it was deleted.
     const kept = this.jobs.filter((job) => !fresh.has(job.id) && page.next !== null && oldest !== undefined && job.created_at < oldest);
     if (kept.length === 0) this.next = page.next;
     this.listed = true;
@@ -70,7 +70,7 @@ export class JobList {
     this.show();
   }
 
-  /** Put in what has just been learned about one job. */
+  /** Update one job in the list, or add it. */
   update(job: Job): void {
     const at = this.jobs.findIndex((one) => one.id === job.id);
     if (at >= 0) this.jobs[at] = newer(this.jobs[at] ?? null, job) ?? (this.jobs[at] as Job);
@@ -78,7 +78,7 @@ export class JobList {
     this.show();
   }
 
-  /** Follow the events of the first running jobs; the one that is shown is followed by whoever shows it. */
+  /** Follow the events of the first running jobs; `Detail` follows the one that is shown. */
   private followRunning(): void {
     const running = this.jobs.filter((job) => job.id !== this.selected && (job.status === "running" || job.status === "cancelling"));
     const wanted = new Set(running.slice(0, FOLLOWED).map((job) => job.id));
@@ -99,7 +99,7 @@ export class JobList {
         const job = progressed(this.jobs.find((one) => one.id === id) ?? null, progress);
         if (job) this.update(job);
       },
-      onTrouble: () => undefined, // said at the top of the page by the next look at the list
+      onTrouble: () => undefined, // the next refresh of the list reports it at the top of the page
     };
     void follow(id, follower, leaving.signal);
   }
@@ -168,10 +168,10 @@ export class JobList {
   }
 }
 
-/** The status in a word or two, with how far the job is or how many are before it. */
+/** The status in a few words, with the progress or the number of jobs ahead. */
 function place(job: Job): string {
   const { status, progress, place_in_queue: ahead } = job;
   if (status === "running" && progress) return `${STATUS_WORDS[status]}, ${percent(Math.round(100 * progress.fraction) / 100)}`;
-  if (status === "queued" && ahead !== null) return ahead === 0 ? "Next" : `${ahead} before it`;
+  if (status === "queued" && ahead !== null) return ahead === 0 ? "Next" : `${ahead} ahead`;
   return STATUS_WORDS[status];
 }

@@ -1,6 +1,6 @@
-// A film's job while it is tracked: its picture at once, and the points as the service reports them.
+// The job of a film while it is tracked: the film's picture immediately, and the points as the service reports them.
 //
-// The picture comes from the file that this tab has sent, decoded by the browser; after a reload only the points are known.
+// The browser decodes the picture from the file that this tab has sent; after a reload only the points are available.
 
 import { h, say } from "./dom";
 import { firstFrame } from "./film";
@@ -10,13 +10,13 @@ type Followed = NonNullable<NonNullable<Job["progress"]>["followed"]>;
 
 const sent = new Map<string, File>();
 
-/** Keep the film of a job that has just been sent, for as long as the tab is open. */
+/** Keep the film of a submitted job while the tab is open. */
 export function rememberFilm(id: string, film: File | null): void {
   if (film) sent.set(id, film);
 }
 
 export class LiveTracks {
-  private readonly canvas = h("canvas", { role: "img", "aria-label": "The film with the points that are tracked" });
+  private readonly canvas = h("canvas", { role: "img", "aria-label": "The film with its tracked points" });
   private readonly words = h("figcaption", { class: "hint" });
   readonly element = h("figure", { class: "live", hidden: true }, this.canvas, this.words);
   private picture: ImageBitmap | HTMLVideoElement | null = null;
@@ -29,7 +29,7 @@ export class LiveTracks {
     new ResizeObserver(() => this.draw()).observe(this.element);
   }
 
-  /** Take a record of the job. */
+  /** Update the picture from a record of the job. */
   show(job: Job): void {
     const { status, progress } = job;
     const pending = job.interpretation.mesh_source === "film" && (status === "queued" || status === "running");
@@ -73,7 +73,7 @@ export class LiveTracks {
 
   private move(followed: Followed): void {
     this.followed = followed;
-    // The points are drawn with the picture that they belong to, once the browser has it.
+    // The points are drawn with the frame they belong to, once the browser has decoded it.
     if (this.video && this.video.readyState > 0) this.video.currentTime = followed.seconds;
     else this.draw();
   }

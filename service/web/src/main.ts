@@ -1,4 +1,4 @@
-// The page: a form, a list, and the job that the address names (#job=…), so that a reload comes back to it.
+// The page: the form, the job list, and the job in the address (#job=…), so that a reload shows it again.
 
 import { AGAIN } from "./afterwards";
 import { Refusal, hasToken, setSingle, setToken } from "./api";
@@ -34,7 +34,7 @@ function show(id: string | null, byPerson: boolean): void {
   detail = null;
   list.select(id);
   welcome.hidden = id !== null;
-  // The form folds away in favour of the job; on a telephone the list does, too.
+  // Showing a job collapses the form; on narrow screens, also the list.
   compose.element.open = id === null;
   list.element.open = id === null || !matchMedia("(max-width: 56rem)").matches;
   if (id === null) return;
@@ -54,13 +54,13 @@ function named(): string | null {
   return new URLSearchParams(location.hash.slice(1)).get("job") || null;
 }
 
-const GATE = "This service needs a token. Paste the one that you were given for this service. It is kept until you close this tab.";
+const GATE = "This service needs a token. Paste the token you were given; this page keeps it until you close the tab.";
 
-/** Show a failure that concerns the whole page at its top, with a form for a token if one is missing. */
+/** Show an error that affects the whole page at the top, with a token form if a token is missing. */
 function report(error: unknown): void {
   if (!(error instanceof Refusal)) throw error;
   const { problem } = error;
-  // Without a token the service's sentence is about a header, which concerns programs.
+  // The service's message for a missing token is about an HTTP header, which is of no use to a visitor.
   const words = problem.code === "unauthorized" ? { ...problem, detail: GATE } : problem;
   const parts: Node[] = [refusalBox(words)];
   if (problem.status === 401) parts.push(tokenForm());
@@ -70,7 +70,7 @@ function report(error: unknown): void {
 function tokenForm(): HTMLElement {
   const input = h("input", { type: "password", id: "token", autocomplete: "off", required: true });
   const form = h("form", { class: "row" }, h("label", { for: "token" }, "Token"), input, h("button", { type: "submit" }, "Use"));
-  if (hasToken()) form.append(button("Forget the token that was refused", () => setToken(""), { class: "quiet" }));
+  if (hasToken()) form.append(button("Forget the rejected token", () => setToken(""), { class: "quiet" }));
   form.addEventListener("submit", (event) => {
     event.preventDefault();
     setToken(input.value.trim());
@@ -81,7 +81,7 @@ function tokenForm(): HTMLElement {
   return form;
 }
 
-/** Offer the example while there are no jobs. */
+/** Offer the available examples. */
 function offer(): void {
   const place = document.getElementById("try") as HTMLElement;
   const [tracks, film] = [compose.hasExample("tracks"), compose.hasExample("film")];
@@ -117,20 +117,20 @@ async function watch(): Promise<void> {
 
 document.addEventListener(AGAIN, (event) => compose.again((event as CustomEvent<Job>).detail));
 
-/** Leave form and list out. */
+/** Hide the form, the job list and the welcome section. */
 function alone(): void {
   setSingle();
   document.body.classList.add("shared");
   welcome.hidden = true;
 }
 
-/** Show one result and nothing that changes anything. */
+/** Show one result, read-only. */
 function showAlone(id: string, note: HTMLElement): void {
   detail = new Detail(id, { onJob: (job) => (document.title = `${title(job)} – Pliant`), onDeleted: () => undefined });
   main.append(note, detail.element);
 }
 
-/** The result that `pliant view` shows. */
+/** The result opened by `pliant view`. */
 function viewed(): string | null {
   return new URLSearchParams(location.hash.slice(1)).get("view");
 }
@@ -146,5 +146,5 @@ if (token === null && local === null) {
   addEventListener("hashchange", () => location.reload());
   alone();
   if (token !== null) await openShared(token, main, showAlone);
-  else if (local !== null) showAlone(local, h("p", { class: "shared-note" }, "A result folder on this computer."));
+  else if (local !== null) showAlone(local, h("p", { class: "shared-note" }, "This result is read from a folder on this computer."));
 }

@@ -1,23 +1,23 @@
-// The form for a job's options, made from the service's own schema: a new option appears here by itself.
+// The form for a job's options, built from the service's schema: new options appear automatically.
 
 import { h, uniqueId } from "./dom";
 import type { Options, Schema } from "./types";
 
-/** Not in the form: the region is drawn, on the first frame. */
+/** Not in the form: the region is drawn on the first frame. */
 const DRAWN = ["region_polygon", "region_frame"];
 
-/** The folds, by what a person wants to change. An option that is in none of them is for experts. */
+/** Collapsible groups of options by purpose. Options in none of them are in the group "Advanced". */
 const FOLDS: [string, string[]][] = [
   ["Files to write", ["outputs", "fps", "axes", "normals", "colours", "glb_motion", "glb_quantized"]],
   ["Camera", ["camera", "focal", "field_of_view", "image_size", "principal_point"]],
-  ["Which frames and points", ["frames", "stride", "max_points", "min_seen", "order"]],
-  ["How the file is read", ["layout", "rows", "coordinates", "coordinate_order", "y_axis", "visibility"]],
+  ["Frames and points", ["frames", "stride", "max_points", "min_seen", "order"]],
+  ["Input format", ["layout", "rows", "coordinates", "coordinate_order", "y_axis", "visibility"]],
   ["Film", ["template_frame", "grid_step", "longest_side"]],
   ["Surface and smoothness", ["surface", "temporal_weight", "spatial_weight", "robust_scale"]],
 ];
-const EXPERTS = "For experts";
+const EXPERTS = "Advanced";
 
-/** What people call an option, and its unit. */
+/** Label of an option, and its unit. */
 const NAMES: Record<string, [string, string?]> = {
   outputs: ["Files"],
   fps: ["Frame rate", "frames/s"],
@@ -30,26 +30,26 @@ const NAMES: Record<string, [string, string?]> = {
   focal: ["Focal length", "pixels"],
   field_of_view: ["Angle of view", "degrees"],
   image_size: ["Picture size", "w×h, pixels"],
-  principal_point: ["Optical centre", "x,y, pixels"],
+  principal_point: ["Principal point", "x,y, pixels"],
   frames: ["Frames", "from:to:step"],
   stride: ["Use every n-th point"],
-  max_points: ["At most", "points"],
-  min_seen: ["Seen at least in", "frames"],
+  max_points: ["Maximum points"],
+  min_seen: ["Visible in at least", "frames"],
   layout: ["Order of the axes"],
   rows: ["Order of the rows"],
   coordinates: ["Meaning of x and y"],
-  coordinate_order: ["Which comes first"],
-  y_axis: ["Y points"],
+  coordinate_order: ["Order of x and y"],
+  y_axis: ["Direction of y"],
   visibility: ["Visibility values"],
   template_frame: ["Start frame"],
-  grid_step: ["Point distance", "pixels"],
+  grid_step: ["Point spacing", "pixels"],
   longest_side: ["Longest side tracked", "pixels"],
   surface: ["Surface"],
   temporal_weight: ["Smoothness in time", "λ1"],
-  spatial_weight: ["Smoothness on surface", "λ2"],
+  spatial_weight: ["Surface smoothness", "λ2"],
   robust_scale: ["Outlier threshold", "track radii"],
   time_limit: ["Time limit", "seconds"],
-  max_reweightings: ["Most rounds"],
+  max_reweightings: ["Maximum reweightings"],
   basis_size: ["Basis shapes"],
   refine_rotations: ["Refine cameras"],
 };
@@ -70,7 +70,7 @@ const LABELS: Record<string, string> = {
   mat: "MATLAB",
   csv: "tables (csv)",
   viewer: "y up, as in viewers",
-  tracks: "as the tracks",
+  tracks: "as in the tracks",
   expected_error: "expected error",
   frames_points: "frames, points",
   points_frames: "points, frames",
@@ -78,7 +78,7 @@ const LABELS: Record<string, string> = {
   yx: "y, then x",
 };
 
-/** What the page calls an option. */
+/** Return the label of an option. */
 export function nameOf(name: string): string {
   return NAMES[name]?.[0] ?? sentence(name.replaceAll("_", " "));
 }
@@ -97,7 +97,7 @@ export class OptionsForm {
   readonly element = h("div", { class: "folds" });
   private fields: Field[] = [];
 
-  /** Build the form from the schema. Until then a job is sent with the defaults. */
+  /** Build the form from the schema. Before that, jobs are submitted with the defaults. */
   load(schema: Schema): void {
     const properties = schema.properties ?? {};
     const names = Object.keys(properties).filter((name) => !DRAWN.includes(name));
@@ -130,14 +130,14 @@ export class OptionsForm {
     return given;
   }
 
-  /** Set one option, for instance a reading that the service offered. */
+  /** Set one option, for example an interpretation that the service offered. */
   set(name: string, value: unknown): void {
     const field = this.fields.find((one) => one.name === name);
     field?.write(value);
     field?.fold.dispatchEvent(new Event("change", { bubbles: true }));
   }
 
-  /** Take over the options of a job. */
+  /** Fill the form with the options of a job. */
   fill(options: Options): void {
     for (const field of this.fields) field.write(field.name in options ? options[field.name] : (field.schema.default ?? null));
     for (const fold of new Set(this.fields.map((field) => field.fold))) fold.dispatchEvent(new Event("change", { bubbles: true }));
@@ -147,7 +147,7 @@ export class OptionsForm {
     this.element.querySelector("summary")?.focus();
   }
 
-  /** Show a refusal below its option; false where the form has no such option. */
+  /** Show an error message below its option; return false if the form has no such option. */
   refuse(name: string, box: HTMLElement): boolean {
     const field = this.fields.find((one) => one.name === name);
     if (field === undefined) return false;
@@ -157,7 +157,7 @@ export class OptionsForm {
     return true;
   }
 
-  /** Remove all refusals. */
+  /** Remove all error messages. */
   clear(): void {
     for (const { answer } of this.fields) answer.replaceChildren();
   }
@@ -216,7 +216,7 @@ function tick(id: string, initial: boolean): Control {
   return { element, read: () => element.checked, write: (value) => void (element.checked = value === true) };
 }
 
-/** Any of some values: a tick for each. */
+/** Any subset of some values: a checkbox for each. */
 function several(id: string, values: unknown[], initial: unknown): Control {
   const boxes = values.map((_, index) => h("input", { id: `${id}-${index}`, type: "checkbox" }));
   const write = (value: unknown): void => {
@@ -257,7 +257,7 @@ function label(value: unknown): string {
   return LABELS[String(value)] ?? String(value);
 }
 
-/** The part of a description that belongs to the chosen value ("robust: …"), or all of it where there is no such part. */
+/** The part of a description that belongs to the chosen value ("robust: …"), or the whole description if there is none. */
 function describe(schema: Schema, chosen: string): string {
   const text = schema.description ?? "";
   const starts = (schema.enum ?? []).map((value) => text.indexOf(`${String(value)}: `)).filter((at) => at >= 0);

@@ -1,4 +1,4 @@
-// What is in a chosen file, read from its first bytes in the browser: array names, shapes and types, before anything is sent.
+// The contents of a chosen file, read in the browser before anything is sent: names, shapes and types of its arrays.
 
 export interface Entry {
   name: string;
@@ -10,7 +10,7 @@ const LOCAL = 0x04034b50;
 const CENTRAL = 0x02014b50;
 const END = 0x06054b50;
 
-/** Return the arrays of an .npy or .npz file; an empty list for anything else. Never throws on a strange file. */
+/** Return the arrays of an .npy or .npz file, or an empty list for any other file. Malformed files do not throw. */
 export async function peek(file: File): Promise<Entry[]> {
   try {
     const head = new Uint8Array(await file.slice(0, 4).arrayBuffer());
@@ -20,7 +20,7 @@ export async function peek(file: File): Promise<Entry[]> {
     }
     if (new DataView(head.buffer).getUint32(0, true) === LOCAL) return await members(file);
   } catch (error) {
-    // Shorter than it says, or not what it says: the service will explain it when it is sent.
+    // The file is truncated or malformed: the service will report the error.
     if (!(error instanceof RangeError || error instanceof TypeError)) throw error;
   }
   return [];
@@ -35,12 +35,12 @@ async function members(file: File): Promise<Entry[]> {
   return found;
 }
 
-/** Where a member of a zip file is. */
+/** Location of a member in a zip file. */
 export interface Member {
   name: string;
   offset: number;
   method: number;
-  /** Bytes in the file. */
+  /** Compressed size in bytes. */
   packed: number;
 }
 
@@ -64,7 +64,7 @@ export async function listing(file: File, most = 10_000): Promise<Member[]> {
   return found;
 }
 
-/** Return a member's content, or null where the browser has no way to unpack it. */
+/** Return a member's content, or null if the browser cannot decompress it. */
 export async function unpacked(file: File, { offset, method, packed }: Member, type: string): Promise<Blob | null> {
   const start = await contentOf(file, offset);
   const content = file.slice(start, start + packed, type);
@@ -74,7 +74,7 @@ export async function unpacked(file: File, { offset, method, packed }: Member, t
   return new Blob([await new Response(stream).arrayBuffer()], { type });
 }
 
-/** Return where a member's content begins, behind its local header. */
+/** Return the offset of a member's content, after its local header. */
 async function contentOf(file: File, offset: number): Promise<number> {
   const local = new DataView(await file.slice(offset, offset + 30).arrayBuffer());
   return offset + 30 + local.getUint16(26, true) + local.getUint16(28, true);
@@ -97,7 +97,7 @@ async function member(file: File, offset: number, method: number): Promise<Omit<
       got = longer;
     }
   } finally {
-    // The rest of the member was cut off on purpose, which the decompressor may call an error.
+    // Only the start of the member was read, which the decompressor may report as an error.
     reader.cancel().catch(() => undefined);
   }
   return header(got);
@@ -121,7 +121,7 @@ function typeName(descr: string): string {
   return kind === "bool" ? kind : kind + 8 * Number(descr.slice(2));
 }
 
-/** Write entries as "tracks 60 × 2400 × 2 float32". */
+/** Format entries as "tracks 60 × 2400 × 2 float32". */
 export function describe(entries: Entry[]): string {
   return entries
     .map((entry) => [entry.name, entry.shape.join(" × ") || "one value", entry.dtype].filter(Boolean).join(" "))

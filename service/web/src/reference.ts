@@ -4,7 +4,7 @@ import SwaggerUI from "swagger-ui-dist/swagger-ui-bundle.js";
 import "swagger-ui-dist/swagger-ui.css";
 import "./readable.css";
 
-/** Name the list of servers and the parts of the page, and put tags and schemas one level below the title, as Swagger UI does not. */
+/** Add what Swagger UI lacks: labels for the server list and the regions, and heading levels for tags and schemas. */
 function nameParts(): void {
   document.querySelector("#servers")?.setAttribute("aria-label", "Server");
   for (const [part, label] of [[".information-container", "About"], [".scheme-container", "Server and access"]] as const) {

@@ -1,27 +1,27 @@
-// A refusal as a sentence, with what was expected, what came, and the ways on.
+// An error message: a sentence, the expected and the actual value, advice, and links.
 
 import { button, h } from "./dom";
 import type { Problem } from "./types";
 
-/** Codes that the page itself gives: the service has no explanation of them. */
+/** Codes defined by the page: the service has no explanation of them. */
 const OURS = ["unreachable", "unknown", "no_events"];
 
-/** What to do, where the service's own words are about requests. */
+/** What to do on the page, where the service's hint is about requests. */
 const ON_THE_PAGE: Record<string, string> = {
-  film_as_tracks: "Choose it under Film instead: its points are followed for you.",
+  film_as_tracks: "Choose it under Film instead; its points are tracked for you.",
   unknown_format: "Choose a file of one of these kinds; the guide shows an example of each.",
   picture_as_tracks: "Depth comes from motion: choose a film, or a zip of all its pictures, under Film.",
-  member_name: "Give the arrays in the file plain names without folders, such as tracks and visibility, and save it again.",
-  duplicate_member: "Give each array in the file a name of its own, and save it again.",
+  member_name: "Save the file again with plain array names without folders, such as tracks and visibility.",
+  duplicate_member: "Save the file again with a unique name for each array.",
 };
 
-/** What the service advises about an option, and what a person does on the page instead. */
+/** The hint of the service about an option, and its replacement on the page. */
 const SCHEMA = "Compare with the schema at /v1/options.";
-const FIELD = "Change the value, or clear the field for the default.";
+const FIELD = "Change the value, or clear the field to use the default.";
 
 /**
- * Make the box that shows a problem. `choose` is called with the reading a person picks where several fit; `inPlace` means that
- * the box stands where the fault is, which need not be named again.
+ * Return a box that shows a problem. `choose` is called with the interpretation that the user picks if several fit; `inPlace` means
+ * that the box is next to the field concerned, so the field is not named again.
  */
 export function refusalBox(problem: Problem, choose?: ((choice: Record<string, unknown>) => void) | null, inPlace = false): HTMLElement {
   const whole = inPlace ? unnamed(problem) : problem.detail;
@@ -53,19 +53,19 @@ function withCode(text: string): (Node | string)[] {
   return text.split("`").map((part, index) => (index % 2 === 1 ? h("code", {}, part) : part));
 }
 
-/** The sentence without the name of the field, which is the service's word for the place where it is shown. */
+/** The sentence without the leading name of the field, which is clear from its position on the page. */
 function unnamed({ detail, field }: Problem): string {
   if (!field || !detail.startsWith(`${field}: `)) return detail;
   const rest = detail.slice(field.length + 2);
   return rest.charAt(0).toUpperCase() + rest.slice(1);
 }
 
-/** Where a person can read on: the guide's section on the kind of file, and the explanation of the code. */
+/** Links to the guide's section on the kind of file, and to the explanation of the code. */
 function helpLinks({ code, field }: Problem): HTMLElement[] {
   const links: HTMLElement[] = [];
   const section = GUIDE[(field ?? "").split(".")[0] ?? ""];
   if (section) links.push(h("a", { href: `guide#${section}`, target: "_blank" }, `What ${section === "films" ? "films" : "files"} can I send?`));
-  // The guide explains what the page itself reports.
+  // The guide explains the codes defined by the page.
   const about = OURS.includes(code) ? "guide#errors" : `errors/${code}`;
   links.push(h("a", { href: about, target: "_blank" }, "About this error"));
   return links;

@@ -20,7 +20,7 @@ export interface Size {
   height: number;
 }
 
-/** Corners that a lasso keeps; the service accepts 1000. */
+/** Maximum number of corners of a lasso; the service accepts 1000. */
 const MOST_CORNERS = 500;
 /** A region with a side shorter than this share of the picture's longest side is a click, not a region. */
 const SMALLEST = 0.01;
@@ -36,7 +36,7 @@ export function polygon(region: Region): Point[] {
   return [[left, top], [right, top], [right, bottom], [left, bottom]];
 }
 
-/** Return a point moved to the nearest one of the picture. */
+/** Return the nearest point inside the picture. */
 export function within([x, y]: Point, size: Size): Point {
   return [clamp(x, 0, size.width), clamp(y, 0, size.height)];
 }
@@ -48,7 +48,7 @@ export function spanned([x0, y0]: Point, [x1, y1]: Point, size: Size): Rectangle
   return { kind: "rectangle", x: Math.min(x0, x1), y: Math.min(y0, y1), width, height };
 }
 
-/** Return the lasso of a stroke, thinned to what the service accepts, or null for one that is too small. */
+/** Return the lasso of a stroke, thinned to `MOST_CORNERS`, or null for one that is too small. */
 export function closed(stroke: Point[], size: Size): Lasso | null {
   const every = Math.ceil(stroke.length / MOST_CORNERS);
   const corners = stroke.filter((_, index) => index % every === 0);
@@ -57,12 +57,12 @@ export function closed(stroke: Point[], size: Size): Lasso | null {
   return { kind: "lasso", corners };
 }
 
-/** Return the rectangle that keyboard drawing begins with: the middle of the picture. */
+/** Return the initial rectangle of keyboard drawing: the middle of the picture. */
 export function centred({ width, height }: Size): Rectangle {
   return { kind: "rectangle", x: width / 4, y: height / 4, width: width / 2, height: height / 2 };
 }
 
-/** Return the region moved, as far as the picture goes. */
+/** Return the region moved, kept inside the picture. */
 export function moved(region: Region, [dx, dy]: Point, size: Size): Region {
   const box = bounds(polygon(region));
   const x = clamp(dx, -box.x, size.width - box.x - box.width);
@@ -71,7 +71,7 @@ export function moved(region: Region, [dx, dy]: Point, size: Size): Region {
   return { kind: "lasso", corners: region.corners.map(([left, top]): Point => [left + x, top + y]) };
 }
 
-/** Return the rectangle, or the one around a lasso, with its right and lower sides moved. */
+/** Return the rectangle, or the bounding box of a lasso, with its right and lower sides moved. */
 export function resized(region: Region, [dx, dy]: Point, size: Size): Rectangle {
   const box = region.kind === "rectangle" ? region : bounds(region.corners);
   const least = SMALLEST * Math.max(size.width, size.height);
@@ -80,7 +80,7 @@ export function resized(region: Region, [dx, dy]: Point, size: Size): Rectangle 
   return { kind: "rectangle", x: box.x, y: box.y, width, height };
 }
 
-/** Return a region in words. */
+/** Return a description of a region. */
 export function described(region: Region | null): string {
   if (region === null) return "No region: the whole picture is tracked.";
   const { x, y, width, height } = bounds(polygon(region));

@@ -6,18 +6,18 @@ import { saveWithToken } from "./links";
 import type { Artifact, Job } from "./types";
 import { bytes, number, unbroken } from "./words";
 
-/** What people call a metric, and what exactly it is; the name of the record stands beside it. */
+/** Title and meaning of each metric, shown beside its name in the record. */
 const METRICS: Record<string, [string, string]> = {
-  e3d_frame: ["3-D error", "distance from the ground truth, each frame turned to fit best; share of the object's size"],
+  e3d_frame: ["3-D error", "distance from the ground truth after the best rotation of each frame; share of the object's size"],
   e3d_frame_scaled: ["3-D error, one scale", "the same after one scale for the whole sequence"],
   e3d_sequence: ["3-D error, one alignment", "the same after one orthogonal alignment for the whole sequence"],
   e3d_frame_similarity: ["Shape error", "the same after rotating, mirroring and scaling each frame to fit"],
   e3d_mocap: ["3-D error, motion capture", "as the motion capture literature defines it; share of the shape's spread"],
   coverage: ["Coverage", "share of the positions within their 90\u00a0% interval"],
-  reprojection_median: ["Reprojection, median", "from a visible track to the projected shape, median; in the tracks' unit"],
-  reprojection_rms: ["Reprojection, root mean square", "the same, root mean square: sensitive to outliers"],
+  reprojection_median: ["Reprojection, median", "median distance from a visible track to the projected shape, in the tracks' unit"],
+  reprojection_rms: ["Reprojection, root mean square", "root mean square of the same distances; sensitive to outliers"],
   rotation_degrees: ["Camera error", "mean angle between estimated and true cameras, in degrees"],
-  focal_error: ["Focal length", "of the focal length, share of the true one"],
+  focal_error: ["Focal length error", "error of the focal length, share of the true value"],
 };
 
 /** The panel "Metrics". */
@@ -27,7 +27,7 @@ export class Metrics {
     "section",
     { class: "panel", "aria-labelledby": "metrics-title" },
     h("h3", { id: "metrics-title" }, "Metrics"),
-    h("table", {}, h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "name"), h("th", { scope: "col", class: "figure" }, "value"))), this.rows),
+    h("table", {}, h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Name"), h("th", { scope: "col", class: "figure" }, "Value"))), this.rows),
   );
 
   show(job: Job): void {
@@ -55,13 +55,13 @@ function metricHead(name: string): HTMLElement {
   return h("th", { scope: "row" }, h("span", { class: "metric" }, title), h("span", { class: "hint" }, h("code", {}, name), ` ${meaning}`));
 }
 
-/** What to know before using a result; stands above the viewer. */
+/** Warnings to read before using a result, shown above the viewer. */
 export class Warnings {
   private readonly items = h("ul", { class: "notes warn" });
   readonly element = h("section", { class: "warnings", "aria-label": "Warnings", hidden: true }, this.items);
 
   show(job: Job): void {
-    // A reason of the verdict stands there already.
+    // The reasons of the verdict are already shown.
     const reasons = new Set(job.verdict_reasons ?? []);
     const warnings = job.warnings.filter((warning) => !reasons.has(warning));
     this.element.hidden = warnings.length === 0;
@@ -71,7 +71,7 @@ export class Warnings {
 
 const SHEET = "contact_sheet.jpg";
 
-/** The panel "Film": frames with the tracks drawn over them. */
+/** The panel "Tracked film": frames with the tracks drawn over them. */
 export class Sheet {
   private readonly figure = h("figure", { class: "sheet" });
   readonly element = h(
@@ -90,7 +90,7 @@ export class Sheet {
       addressOf(artifactPath(job.id, SHEET))
         .then((address) => (picture.src = address))
         .catch((error: unknown) => {
-          if (!(error instanceof Refusal)) throw error; // the words in place of the picture remain
+          if (!(error instanceof Refusal)) throw error; // the alternative text remains
         });
       const link = saveLink(job, sheet, `Save ${SHEET}`);
       return [picture, h("figcaption", { class: "hint" }, `${sheet.description} Check that the points stay on the object. `, link)];
@@ -98,12 +98,12 @@ export class Sheet {
   }
 }
 
-/** Return an address for a picture: the path itself, or its content where the request needs a token. */
+/** Return an address for a picture: the path itself, or a data: URL of its content if the request needs a token. */
 async function addressOf(path: string): Promise<string> {
   if (!("Authorization" in headers())) return path;
   const content = await (await call(path)).blob();
   return new Promise((resolve, reject) => {
-    const reader = new FileReader(); // the page's policy admits data: for pictures, not blob:
+    const reader = new FileReader(); // the content security policy allows data: for pictures, not blob:
     reader.onload = () => resolve(String(reader.result));
     reader.onerror = () => reject(reader.error as DOMException);
     reader.readAsDataURL(content);

@@ -57,7 +57,7 @@ export interface components {
         };
         /**
          * Estimate
-         * @description What a job is expected to need, from the numbers of its frames and points. Right within a factor of about two.
+         * @description Expected memory and time of a job, from its numbers of frames and points. Correct within a factor of about two.
          */
         Estimate: {
             /**
@@ -110,7 +110,7 @@ export interface components {
         };
         /**
          * FollowedPoints
-         * @description Some points of a film in the frame that was tracked last.
+         * @description A sample of a film's points in the frame that was tracked last.
          */
         FollowedPoints: {
             /**
@@ -454,7 +454,7 @@ export interface components {
         };
         /**
          * Options
-         * @description How to reconstruct. Every option has a default; unknown names are rejected.
+         * @description Options of a reconstruction. Every option has a default; unknown names are rejected.
          */
         Options: {
             /**
@@ -970,7 +970,7 @@ export interface components {
         Status: "queued" | "running" | "cancelling" | "succeeded" | "failed" | "cancelled";
         /**
          * Upload
-         * @description A large input that is uploaded separately and then named by jobs.
+         * @description A large input that is uploaded separately and then referenced by jobs.
          */
         Upload: {
             /** Id */
@@ -1003,7 +1003,7 @@ export interface components {
         };
         /**
          * OutputRequest
-         * @description Files to write of a stored result. Each option that is null stays as the job has it.
+         * @description Files to write from a stored result. Options that are null keep the job's values.
          */
         OutputRequest: {
             /**
@@ -1019,38 +1019,38 @@ export interface components {
             fps: number | null;
             /**
              * Normals
-             * @description As the option of a job.
+             * @description As in the options of a job.
              * @default null
              */
             normals: ("static" | "animated" | "none") | null;
             /**
              * Colours
-             * @description As the option of a job.
+             * @description As in the options of a job.
              * @default null
              */
             colours: ("none" | "error" | "expected_error") | null;
             /**
              * Axes
-             * @description As the option of a job.
+             * @description As in the options of a job.
              * @default null
              */
             axes: ("tracks" | "viewer") | null;
             /**
              * Glb Quantized
-             * @description As the option of a job.
+             * @description As in the options of a job.
              * @default null
              */
             glb_quantized: boolean | null;
             /**
              * Glb Motion
-             * @description As the option of a job.
+             * @description As in the options of a job.
              * @default null
              */
             glb_motion: ("auto" | "frames") | null;
         };
         /**
          * ShareRequest
-         * @description How long a share link is valid.
+         * @description Request for a share link.
          */
         ShareRequest: {
             /**

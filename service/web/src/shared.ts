@@ -1,4 +1,4 @@
-// What a visitor of a share link sees: one result, how long it can be seen, and a sentence once it cannot.
+// The page of a share link: one result and the expiry of the link, or why the link is not valid.
 
 import { Refusal, listShares, setShare } from "./api";
 import { h, say } from "./dom";
@@ -10,17 +10,17 @@ export function sharedToken(): string | null {
   return new URLSearchParams(location.hash.slice(1)).get("share");
 }
 
-/** The job of a share link's token. */
+/** The job id in the token of a share link. */
 function sharedJob(token: string): string {
   return token.slice(token.indexOf(".") + 1, token.lastIndexOf("."));
 }
 
-/** Show the result that a share link opens through `show`, with a note above it; or, in `place`, why it shows nothing. */
+/** Call `show` with the result of a share link and a note to place above it; or explain in `place` why there is none. */
 export async function openShared(token: string, place: HTMLElement, show: (id: string, note: HTMLElement) => void): Promise<void> {
   setShare(token);
   const id = sharedJob(token);
   const until = h("span", { class: "until" });
-  const note = h("p", { class: "shared-note", role: "status" }, "You see a shared result, read-only. ", until);
+  const note = h("p", { class: "shared-note", role: "status" }, "This is a shared, read-only result. ", until);
   try {
     const [link] = await listShares(id);
     if (link) tell(until, new Date(link.expires_at));
@@ -29,25 +29,25 @@ export async function openShared(token: string, place: HTMLElement, show: (id: s
     const ended = sentence(error);
     if (ended !== null) {
       document.title = "Shared result – Pliant";
-      place.append(h("section", { class: "shared-note", role: "status" }, h("h2", {}, "This result can no longer be seen"), h("p", {}, ended)));
+      place.append(h("section", { class: "shared-note", role: "status" }, h("h2", {}, "This result is no longer available"), h("p", {}, ended)));
       return;
     }
   }
   show(id, note);
 }
 
-/** State the end of the link now, and that it has ended when it has. */
+/** Show when the link expires, and later that it has expired. */
 function tell(place: HTMLElement, end: Date): void {
   const left = end.getTime() - Date.now();
   if (left > 0) {
     say(place, `The link is valid until ${moment(end)}.`);
     setTimeout(() => tell(place, end), Math.min(left, LONGEST_WAIT));
   } else {
-    say(place, `The link expired on ${moment(end)}: what is shown stays until you close or reload this page. For more, ask its sender for a new link.`);
+    say(place, `The link expired on ${moment(end)}. This result stays visible until you close or reload the page. Ask its sender for a new link.`);
   }
 }
 
-/** Why a link shows nothing, null where the reason is another one than the link. */
+/** Why a link is not valid; null if the error has another cause. */
 function sentence({ problem }: Refusal): string | null {
   const end = new Date(problem.got ?? "");
   if (problem.code === "expired_share") {
@@ -56,7 +56,7 @@ function sentence({ problem }: Refusal): string | null {
   return problem.code === "invalid_share" ? problem.detail : null;
 }
 
-/** A date and time as the visitor writes it. */
+/** A date and time in the visitor's locale. */
 function moment(date: Date): string {
   return date.toLocaleString(undefined, { dateStyle: "long", timeStyle: "short" });
 }

@@ -1,4 +1,4 @@
-// The files of a new job: a film, or tracks with a mesh. Each place is filled by drop or by choice, and shows what it holds.
+// The files of a new job: a film, or tracks with a mesh. Each slot accepts a dropped or chosen file and shows its contents.
 
 import { CameraDialog, canRecord } from "./camera";
 import { button, h, uniqueId } from "./dom";
@@ -14,7 +14,7 @@ export const PLACES: Record<Part, { label: string; hint: string }> = {
   tracks: { label: "Tracks", hint: "npz, npy, mat, csv …" },
   mesh: { label: "Mesh", hint: "optional: obj, ply, glb, npz" },
   ground_truth: { label: "Ground truth", hint: "optional: used to measure errors" },
-  rotations: { label: "Cameras", hint: "optional: if they are known" },
+  rotations: { label: "Cameras", hint: "optional: if known" },
 };
 
 interface Slot {
@@ -29,14 +29,14 @@ interface Slot {
 
 export class Slots {
   readonly element = h("div", { class: "zone" });
-  /** True where the service tracks films. */
+  /** True if the service tracks films. */
   hasFilms = false;
   private readonly slots = new Map<Part, Slot>();
   private readonly filming = new Filming(() => this.onChange());
   private readonly title = h("p", { class: "zone-title" }, "Drop tracks and a mesh here");
   private readonly grid = h("input", { type: "text", id: "grid", placeholder: "rows×columns", size: 10, autocomplete: "off" });
 
-  /** `onChange` is told when another set of files is there. */
+  /** `onChange` is called when the files or the region have changed. */
   constructor(private readonly onChange: () => void) {
     const promise = h("p", { class: "hint" }, "Files are sent to this service only.");
     this.element.append(this.title, promise, ...PARTS.map((part) => this.slot(part)));
@@ -45,14 +45,14 @@ export class Slots {
     this.acceptDrops();
   }
 
-  /** Offer the place for a film: the service tracks films. */
+  /** Show the slot for a film: the service tracks films. */
   acceptFilms(): void {
     this.hasFilms = true;
     this.title.textContent = "Drop a film here, or tracks and a mesh";
     this.arrange();
   }
 
-  /** The files to send, and a grid's size where there is no mesh file. A film is sent alone: its tracks are made of it. */
+  /** The files to submit, and the size of a grid if there is no mesh file. A film is submitted alone: the service tracks it. */
   get given(): { files: [Part, File][]; grid: string } {
     const film = this.file("film");
     if (film) return { files: [["film", film]], grid: "" };
@@ -61,7 +61,7 @@ export class Slots {
     return { files: files.filter((one): one is [Part, File] => one[1] !== null), grid };
   }
 
-  /** What to track in the film: corners in its pixels; null: the whole picture. */
+  /** The region to track in the film: corners in film pixels; null: the whole picture. */
   get region(): Point[] | null {
     return this.file("film") && this.filming.outline;
   }
@@ -70,12 +70,12 @@ export class Slots {
     return this.slots.get(part)?.file ?? null;
   }
 
-  /** The file that a job would be named after. */
+  /** The file after which the job is named. */
   get main(): File | null {
     return this.file("film") ?? this.file("tracks");
   }
 
-  /** Show a refusal in the place of its file; false where that place is not shown. */
+  /** Show an error message in the slot of its file; return false if that slot is not shown. */
   refuse(part: string, box: HTMLElement): boolean {
     const slot = this.slots.get((part === "region" ? "film" : part) as Part);
     if (slot === undefined || slot.row.hidden) return false;
@@ -84,7 +84,7 @@ export class Slots {
     return true;
   }
 
-  /** Remove all refusals. */
+  /** Remove all error messages. */
   clear(): void {
     for (const { answer } of this.slots.values()) answer.replaceChildren();
   }
@@ -93,25 +93,25 @@ export class Slots {
     this.slots.get(part)?.input.focus();
   }
 
-  /** Put these files into their places, and nothing else. */
+  /** Fill the slots with these files and empty the others. */
   async fill(files: [Part, File][]): Promise<void> {
     for (const part of PARTS) await this.show(part, files.find(([of]) => of === part)?.[1] ?? null);
     this.onChange();
   }
 
-  /** Choose what to track in the film: corners in its pixels. */
+  /** Choose the region to track in the film: corners in film pixels. */
   async outline(corners: Point[]): Promise<void> {
     await this.filming.take(corners);
   }
 
-  /** The service has read the files as they are now: it can show a film that the browser cannot. */
+  /** Take the interpretation of the current files: it may have the first frame of a film that the browser cannot decode. */
   async seen(seen: Inspection): Promise<void> {
     const film = this.file("film");
     const picture = film && (await servedFrame(seen).catch(() => null)); // not a picture after all
     if (picture) this.filming.offer(film, picture);
   }
 
-  /** Put dropped files where their names and contents say they belong. */
+  /** Assign dropped files to slots by their names and contents. */
   async take(files: File[]): Promise<void> {
     for (const file of files) {
       const entries = await peek(file);
@@ -140,7 +140,7 @@ export class Slots {
     };
     slot.input.addEventListener("change", () => void this.put(part, slot.input.files?.[0] ?? null));
     this.slots.set(part, slot);
-    // The label reaches over the whole row, so that a thumb hits it.
+    // The label covers the whole row, to be an easy touch target.
     const choose = h("label", { for: id, class: "choose" }, label);
     const pick = h("span", { class: "pick", "aria-hidden": "true" }, "Choose");
     slot.row.append(slot.input, choose, pick, slot.hint, slot.remove, slot.contents);
@@ -184,7 +184,7 @@ export class Slots {
     if (slot.file === file && entries.length > 0) slot.contents.textContent = describe(entries);
   }
 
-  /** A film takes the place of tracks and all that belongs to them. */
+  /** A film replaces the slots of tracks, mesh, ground truth and cameras. */
   private arrange(): void {
     const hasFilm = this.file("film") !== null;
     for (const [part, slot] of this.slots) slot.row.hidden = part === "film" ? !this.hasFilms : hasFilm;
@@ -218,7 +218,7 @@ const NAMED: [Part, RegExp][] = [
   ["mesh", /mesh|faces/i],
 ];
 
-/** Decide what a dropped file is: by the arrays in it, then by its name, then tracks first and a mesh second. */
+/** Return the role of a dropped file: by the arrays in it, then by its name; else tracks first and a mesh second. */
 function roleOf(name: string, entries: Entry[], haveTracks: boolean): Part {
   for (const [part, pattern] of WITHIN) if (entries.some((entry) => pattern.test(entry.name))) return part;
   for (const [part, pattern] of NAMED) if (pattern.test(name)) return part;

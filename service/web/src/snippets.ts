@@ -1,4 +1,4 @@
-// The code that submits the job shown: the same options, the same parts, this service's address.
+// Code that submits the same job: the same options and parts, and this service's URL.
 
 import { getOptions } from "./api";
 import { button, fill, h } from "./dom";
@@ -33,7 +33,7 @@ export class Snippets {
     this.job = job;
     void getOptions().then(
       (schema) => this.write(job, schema),
-      () => this.write(job, {}), // without the defaults every option is written out, which is as right
+      () => this.write(job, {}), // without the defaults, every option is written out, which is equivalent
     );
   }
 
@@ -49,7 +49,7 @@ export class Snippets {
   }
 
   private async copy(): Promise<void> {
-    // The clipboard is only there on https and on localhost; elsewhere the text is selected, ready for Ctrl-C.
+    // The clipboard is available only on HTTPS and localhost; elsewhere the text is selected for Ctrl+C.
     try {
       await navigator.clipboard.writeText(this.code.textContent ?? "");
       this.copied.textContent = "Copied.";
@@ -63,13 +63,13 @@ export class Snippets {
 
 type Given = [string, unknown][];
 
-/** The options in which a job differs from the defaults. */
+/** The options of a job that differ from the defaults. */
 function given(job: Job, schema: Schema): Given {
   const differs = (name: string, value: unknown): boolean => JSON.stringify(value) !== JSON.stringify(schema.properties?.[name]?.default ?? null);
   return Object.entries(job.options).filter(([name, value]) => differs(name, value));
 }
 
-/** The parts of the form, with names that stand for the reader's own files; a grid and "no mesh" are said in words. */
+/** The parts of the form, with placeholder file names; a grid is given by its size, and a missing mesh as "none". */
 function parts(job: Job): [string, string][] {
   const seen = job.interpretation;
   if (ofFilm(job)) return [["film", "film.mp4"]];
@@ -84,7 +84,7 @@ function parts(job: Job): [string, string][] {
 
 const ofFilm = (job: Job): boolean => job.interpretation.mesh_source === "film";
 
-/** Write the job as a program. */
+/** Return the code for a job. */
 function snippet(job: Job, options: Given, language: Language, url: string): string {
   if (language === "Python") return python(job, options, url);
   if (language === "Shell") return shell(job, options, url);

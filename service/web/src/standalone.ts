@@ -1,4 +1,4 @@
-// The viewer in a page of its own, as the button "HTML page" saves it: the files are in the page, in base64.
+// The viewer in a self-contained page, as saved by the button "HTML page": the files are embedded in base64.
 
 import { Viewer } from "./viewer/viewer";
 

@@ -1,4 +1,4 @@
-// What the tab shows of a job while another one is in front: progress in its title, and a notification at the end.
+// The state of a job while its tab is in the background: progress in the title, and a notification at the end.
 
 import { button, say } from "./dom";
 import { type Job, isFinal } from "./types";
@@ -8,7 +8,7 @@ import { STATUS_WORDS, percent, title } from "./words";
 const PLAIN = "Pliant";
 
 export class Tab {
-  /** Asks for permission when it is pressed: browsers refuse pages that ask unasked. */
+  /** Requests permission when pressed: browsers block requests without a user action. */
   readonly element = button("Notify me at the end", () => void this.ask(), { class: "quiet", hidden: true });
   private wanted = false;
   private job: Job | null = null;
@@ -22,7 +22,7 @@ export class Tab {
     if (!pending && before !== null && !isFinal(before.status) && this.wanted) this.notify(job);
   }
 
-  /** Another job is shown, or none. */
+  /** Reset the title: another job is shown, or none. */
   leave(): void {
     document.title = PLAIN;
   }
@@ -44,12 +44,12 @@ export class Tab {
   }
 }
 
-/** The part of the title that is read first, since tabs are narrow. */
+/** The start of the title, which stays readable in narrow tabs. */
 function lead(job: Job): string {
   return `${job.status === "running" ? percent(job.progress?.fraction ?? 0) : outcome(job)} – `;
 }
 
-/** The verdict where there is one, else how far the job is. */
+/** The verdict if there is one, else the status of the job. */
 function outcome(job: Job): string {
   const verdict = verdictOf(job);
   return verdict ? VERDICTS[verdict] : STATUS_WORDS[job.status];

@@ -6,7 +6,7 @@ import type { components } from "./schema";
 type Schemas = components["schemas"];
 
 export type Status = Schemas["Status"];
-/** A problem of the service, or one that the page itself found. */
+/** A problem reported by the service or detected by the page. */
 export type Problem = Pick<Schemas["Problem"], "title" | "status" | "detail"> & {
   [Name in Exclude<keyof Schemas["Problem"], "code">]?: Schemas["Problem"][Name] | undefined;
 } & { code: Schemas["ProblemCode"] | "unreachable" | "unknown" | "no_events" };
@@ -14,10 +14,10 @@ export type Progress = Schemas["Progress"];
 export type Artifact = Schemas["Artifact"];
 export type Interpretation = Schemas["Interpretation"];
 export type Inspection = Schemas["Inspection"];
-/** Options by name: the form is built from the schema at /v1/options. */
+/** Options by name; the form is built from the schema at /v1/options. */
 export type Options = Record<string, unknown>;
 export type Verdict = "good" | "with_care" | "do_not_use";
-/** Judged without ground truth; missing in the records of older services, null where a job was not judged. */
+/** The verdict, reached without ground truth; missing in records of older services, null if a job was not judged. */
 interface Trust {
   verdict?: Verdict | null;
   verdict_reasons?: string[];
@@ -27,7 +27,7 @@ export type Job = Omit<Schemas["Job"], "options" | "error" | keyof Trust> & Trus
 export type Share = Schemas["Share"];
 export type JobPage = Omit<Schemas["JobPage"], "jobs"> & { jobs: Job[] };
 
-/** The part of a JSON Schema that the options' schema uses. */
+/** The subset of JSON Schema that the options' schema uses. */
 export interface Schema {
   type?: string;
   enum?: unknown[];
@@ -44,7 +44,7 @@ export interface Schema {
   properties?: Record<string, Schema>;
 }
 
-/** The input files of a job, by the name of their form part. */
+/** The input files of a job by the names of their form parts. */
 export const PARTS = ["film", "tracks", "mesh", "ground_truth", "rotations"] as const;
 export type Part = (typeof PARTS)[number];
 

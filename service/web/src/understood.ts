@@ -1,4 +1,4 @@
-// How inputs are understood: asked of the service before a job is made of them, and shown again with the job.
+// How the service interprets the inputs: shown before a job is submitted, and again with the job.
 
 import { Refusal, inspect } from "./api";
 import { button, fill, h } from "./dom";
@@ -9,25 +9,25 @@ import { bytes, count, percent } from "./words";
 const MESHES: Record<string, string> = {
   given: "as given",
   grid: "from the grid",
-  delaunay: "made by triangulating the best-seen frame",
-  none: "none: points alone",
+  delaunay: "triangulated in the frame with the most visible points",
+  none: "none, points only",
   film: "from the grid of tracked points",
 };
 
-/** What the service made of the inputs, as terms and words. */
+/** The interpretation of the inputs, as terms and descriptions. */
 function facts(seen: Interpretation): [string, string][] {
-  // A film is opened before a job is made of it, and tracked when the job runs.
+  // The points of a film are not known until the job tracks it.
   if (seen.num_points === 0) return [["Film", seen.num_frames > 0 ? count(seen.num_frames, "frame") : "frames not counted yet"]];
   return [
     ["Tracks", `${count(seen.num_frames, "frame")} of ${count(seen.num_points, "point")}, ${percent(seen.hidden_fraction)} hidden`],
     ["Layout", `${seen.layout}, y ${seen.y_axis}`],
-    ["Mesh", seen.num_faces > 0 ? `${count(seen.num_faces, "face")}, ${MESHES[seen.mesh_source] ?? seen.mesh_source}` : "none: points alone"],
+    ["Mesh", seen.num_faces > 0 ? `${count(seen.num_faces, "face")}, ${MESHES[seen.mesh_source] ?? seen.mesh_source}` : "none, points only"],
     ["Ground truth", seen.has_ground_truth ? "given; errors are measured against it" : "none"],
     ["Cameras", seen.has_rotations ? "given" : "estimated"],
   ];
 }
 
-/** Terms, words and notes; rewritten only where they differ. */
+/** Terms, descriptions and notes; updated only if they differ. */
 class Facts {
   readonly list = h("dl", { class: "facts" });
   readonly notes = h("ul", { class: "notes" });
@@ -56,11 +56,11 @@ export class Understood {
   }
 }
 
-/** Files up to this size are asked about by themselves; they travel again with the job. */
+/** Files up to this total size, in bytes, are checked automatically; they are uploaded again with the job. */
 const BY_ITSELF = 64e6;
 const SETTLES = 250;
 
-/** Asks how the chosen files are understood while the form is being filled in. */
+/** Shows how the service interprets the chosen files while the form is being filled in. */
 export class Inspection {
   private readonly facts = new Facts();
   private readonly glimpse = new Glimpse();
@@ -78,7 +78,7 @@ export class Inspection {
   private asking: AbortController | null = null;
   private timer = 0;
 
-  /** `form` gives what would be sent, null where there is neither a film nor tracks; `refused` shows why it would be refused, `onSeen` gets the answer. */
+  /** `form` returns what would be submitted, or null without a film or tracks; `refused` shows the error, if any; `onSeen` gets the interpretation. */
   constructor(
     private readonly form: () => FormData | null,
     private readonly refused: (refusal: Refusal | null) => void,
@@ -87,7 +87,7 @@ export class Inspection {
     this.clear();
   }
 
-  /** The files or the options that say how to read them are others now. */
+  /** The files, or the options for reading them, have changed. */
   changed(): void {
     this.clear();
     this.refused(null);
@@ -96,12 +96,12 @@ export class Inspection {
     const size = [...form.values()].reduce((sum, value) => sum + (value instanceof File ? value.size : 0), 0);
     if (size <= BY_ITSELF) this.timer = setTimeout(() => void this.send(), SETTLES);
     else {
-      this.words.textContent = `${bytes(size)} are not read before you ask.`;
+      this.words.textContent = `Files this large (${bytes(size)}) are checked on request only.`;
       this.ask.hidden = false;
     }
   }
 
-  /** Stop asking; a job is being made of it. */
+  /** Stop checking: the job is being submitted. */
   stop(): void {
     clearTimeout(this.timer);
     this.asking?.abort();
@@ -138,7 +138,7 @@ export class Inspection {
       if (asking.signal.aborted) return;
       this.words.textContent = "";
       if (!(error instanceof Refusal)) throw error;
-      // An older service has no such question, and a busy one no time for it: sending says what there is to say.
+      // Ignore other errors, for example of older services without this endpoint or of busy ones: submitting reports them.
       if (error.problem.status === 422 || error.problem.status === 413) this.refused(error);
     }
   }

@@ -1,4 +1,4 @@
-// Whether a result can be used: a badge with an icon and words, the expected error, and the reasons.
+// The verdict on a result: a badge with icon and text, the expected error, and the reasons.
 
 import { fill, h, svg } from "./dom";
 import type { Job, Verdict } from "./types";
@@ -25,13 +25,13 @@ export function badge(verdict: Verdict): HTMLElement {
   return h("span", { class: "badge", "data-verdict": verdict }, icon, VERDICTS[verdict]);
 }
 
-/** Return the verdict of a finished job, or null where none was reached or the page does not know it. */
+/** Return the verdict of a finished job, or null if it has none or an unknown one. */
 export function verdictOf(job: Job): Verdict | null {
   const { status, verdict } = job;
   return status === "succeeded" && verdict && verdict in VERDICTS ? verdict : null;
 }
 
-/** The section "Verdict", hidden for jobs that have none. */
+/** The section "Verdict", hidden for jobs without one. */
 export class VerdictBox {
   private readonly badge = h("p", {});
   private readonly trust = h("p", { class: "trust" });
@@ -64,12 +64,12 @@ export class VerdictBox {
     fill(this.outcome, job.sentence ?? "", () => [job.sentence && `Solver: ${job.sentence}`]);
   }
 
-  /** Show what only the report has: the interval of the expected error and the figures behind the verdict. */
+  /** Show what only the report contains: the interval of the expected error and the figures behind the verdict. */
   report(report: Record<string, unknown>): void {
     const interval = report["expected_error_interval"];
     const [low, high] = Array.isArray(interval) ? interval.map(Number) : [];
     const words =
-      low === undefined || high === undefined ? "" : `In nearly eight of ten sequences the true error is between ${percent(low)} and ${percent(high)}.`;
+      low === undefined || high === undefined ? "" : `Likely range of the true error: ${percent(low)} to ${percent(high)} (correct in nearly eight of ten sequences).`;
     fill(this.interval, words, () => [words]);
     const rows = evidenceOf(report);
     this.figures.hidden = rows.length === 0;
@@ -77,7 +77,7 @@ export class VerdictBox {
   }
 }
 
-/** Return the figures that the verdict rests on, each with its unit; those that the report does not have are left out. */
+/** Return the figures behind the verdict, each with its unit, as far as the report contains them. */
 function evidenceOf(report: Record<string, unknown>): [string, string][] {
   const degrees = (value: number): string => `${value < 10 ? Number(value.toPrecision(2)) : Math.round(value)}°`;
   const share = (value: number): string => `${value < 0.0005 ? "below 0.1\u00a0%" : percent(value)} of the object's size`;
@@ -85,7 +85,7 @@ function evidenceOf(report: Record<string, unknown>): [string, string][] {
     ["turn_degrees", "Turn between the most different views", degrees],
     ["degrees_per_frame", "Turn per frame (median)", degrees],
     ["deformation_per_frame", "Change of shape per frame (median)", share],
-    ["held_out_error", "Left-out observations, distance from their prediction (median)", share],
+    ["held_out_error", "Prediction error of held-out observations (median)", share],
   ];
   return known.flatMap(([name, term, words]) => {
     const value = report[name];

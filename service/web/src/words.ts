@@ -17,7 +17,7 @@ export function number(value: number | null | undefined): string {
   return value.toPrecision(size < 1 ? 3 : 4);
 }
 
-/** No line ends between a number and its per cent sign. */
+/** A non-breaking space between a number and its percent sign. */
 const PERCENT = "\u00a0%";
 
 export function percent(fraction: number): string {
@@ -27,20 +27,20 @@ export function percent(fraction: number): string {
 
 const twoDigits = new Intl.NumberFormat("en", { minimumSignificantDigits: 2, maximumSignificantDigits: 2 });
 
-/** A share of the object's size in percent: two significant digits below 10, whole numbers from there; never with an exponent. */
+/** A share of the object's size in percent: two significant digits below 10, whole numbers from 10; never in exponential notation. */
 export function ofSize(share: number): string {
   const value = 100 * share;
-  // Below that two identical results differ by rounding alone.
+  // Smaller values are rounding errors: two identical results differ by as much.
   const digits = value < 5e-5 ? "0" : value < 10 ? twoDigits.format(value) : whole.format(value);
   return `${digits}${PERCENT} of the size`;
 }
 
-/** A length of a job's picture, with its unit: pixels of a film, else whatever unit the tracks have. */
+/** A length in the picture with its unit: pixels for a film, else the unit of the tracks. */
 export function inTracksUnit(value: number, job: Job): string {
   return `${number(value)} ${job.interpretation.mesh_source === "film" ? "pixels" : "(tracks' unit)"}`;
 }
 
-/** A sentence of the service, without line ends between a number and its per cent sign. */
+/** A message of the service, with non-breaking spaces between numbers and percent signs. */
 export function unbroken(text: string): string {
   return text.replace(/(\d) %/g, `$1${PERCENT}`);
 }
@@ -58,7 +58,7 @@ export function bytes(value: number): string {
 }
 
 function seconds(value: number): string {
-  if (value < 1) return "less than a second";
+  if (value < 1) return "a second";
   if (value < 90) return count(Math.round(value), "second");
   if (value < 5400) return count(Math.round(value / 60), "minute");
   return `${(value / 3600).toFixed(1)} hours`;
@@ -82,7 +82,7 @@ export function ago(iso: string, now = Date.now()): string {
 
 export function title(job: Job): string {
   const own = job.name || `Job ${(job.outputs_of ?? job.id).slice(0, 8)}`;
-  return job.outputs_of ? `${own}: further files` : own;
+  return job.outputs_of ? `${own}: more files` : own;
 }
 
 export const STATUS_WORDS: Record<Status, string> = {
@@ -98,7 +98,7 @@ const STAGES: Record<string, string> = {
   track: "Tracking the film",
   loading: "Reading the tracks",
   cameras: "Estimating the cameras",
-  initialise: "First shapes",
+  initialise: "Computing the first shapes",
   reweight: "Refining the shapes",
   finish: "Finishing",
   exporting: "Writing the files",
@@ -111,7 +111,7 @@ export function standing(job: Job): string {
       if (job.place_in_queue === null) return "Queued; waiting for a worker.";
       return job.place_in_queue === 0
         ? "Next in the queue."
-        : `In the queue: ${count(job.place_in_queue, "job")} before this one.`;
+        : `Queued; ${count(job.place_in_queue, "job")} ahead of this one.`;
     case "running": {
       const progress = job.progress;
       if (progress === null) return "Started.";
@@ -126,11 +126,11 @@ export function standing(job: Job): string {
     case "cancelling":
       return "Stopping at the next iteration.";
     case "succeeded":
-      // The verdict's section shows the sentence beside the verdict: that the solver converged does not make a result good.
+      // The section "Verdict" shows the solver's sentence beside the verdict: convergence alone does not make a result good.
       return job.verdict ? "" : `${job.sentence ?? "Done."} The quality of this result was not assessed.`;
     case "failed":
-      return job.error?.detail ?? "The job failed; its log has the details.";
+      return job.error?.detail ?? "The job failed; see the service's log for details.";
     case "cancelled":
-      return "This job was cancelled before it was done, so it has no results. “Try again” runs it from the same files.";
+      return "This job was cancelled before it finished, so it has no result. “Try again” runs it with the same files.";
   }
 }

@@ -1,4 +1,4 @@
-"""What users hand over becomes files the service reads; what cannot become one is refused here."""
+"""User inputs become files that the service reads; inputs that cannot are rejected by the client."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 class Tensor:
-    """As PyTorch's: on a device, part of a graph."""
+    """Like a PyTorch tensor on a device and in a graph."""
 
     def __init__(self, array: np.ndarray, *, attached: bool = True, remote: bool = True) -> None:
         self.array, self.attached, self.remote = array, attached, remote
@@ -40,7 +40,7 @@ class Tensor:
         return self.array
 
 
-def test_an_array_keeps_its_type_and_gets_its_visibility(tmp_path: Path) -> None:
+def test_an_array_keeps_its_dtype_and_stores_its_visibility(tmp_path: Path) -> None:
     held = arrays(tracks_file(POINTS, np.ones((4, 9), bool), tmp_path))
     np.testing.assert_array_equal(held["tracks"], POINTS)
     assert held["tracks"].dtype == np.float32
@@ -48,7 +48,7 @@ def test_an_array_keeps_its_type_and_gets_its_visibility(tmp_path: Path) -> None
     assert set(arrays(tracks_file(POINTS.tolist(), None, tmp_path))) == {"tracks"}
 
 
-def test_a_mask_is_inverted_visibility(tmp_path: Path) -> None:
+def test_masked_array_entries_become_hidden_points(tmp_path: Path) -> None:
     mask = np.zeros(POINTS.shape, bool)
     mask[1, 2, 0] = True
     held = arrays(tracks_file(np.ma.masked_array(POINTS, mask), None, tmp_path))
@@ -71,7 +71,7 @@ def test_the_same_arrays_make_the_same_bytes(tmp_path: Path) -> None:
     assert one == other
 
 
-def test_meshes_are_faces_files_or_words(tmp_path: Path) -> None:
+def test_meshes_can_be_grid_sizes_faces_or_files(tmp_path: Path) -> None:
     assert mesh_part((3, 4), tmp_path) == mesh_part("3 x 4", tmp_path) == mesh_part("3X4", tmp_path) == "3x4"
     assert mesh_part("none", tmp_path) == "none"
     faces = mesh_part([[0, 1, 2], [0, 2, 3]], tmp_path)
@@ -80,7 +80,7 @@ def test_meshes_are_faces_files_or_words(tmp_path: Path) -> None:
     assert mesh_part(faces, tmp_path) == mesh_part(str(faces), tmp_path) == faces
 
 
-def test_truth_and_cameras_are_arrays_dictionaries_or_files(tmp_path: Path) -> None:
+def test_ground_truth_can_be_an_array_a_dictionary_or_a_file(tmp_path: Path) -> None:
     path = array_part(np.zeros((4, 9, 3)), "ground_truth", "shapes", tmp_path)
     assert list(arrays(path)) == ["shapes"]
     assert set(arrays(array_part({"shapes": [1.0], "rotations": [2.0]}, "ground_truth", "shapes", tmp_path))) == {
@@ -96,7 +96,7 @@ def test_truth_and_cameras_are_arrays_dictionaries_or_files(tmp_path: Path) -> N
         (lambda here: tracks_file("nowhere.npz", None, here), "got no file at nowhere.npz"),
         (
             lambda here: tracks_file("~nosuchuser/x.npz", None, here),
-            "tracks: expected a path, got ~nosuchuser/x.npz, and ~nosuchuser is nobody's home directory",
+            "tracks: expected a path, got ~nosuchuser/x.npz, and ~nosuchuser is no user's home directory",
         ),
         (lambda here: tracks_file({"tracks": POINTS}, np.ones((4, 9)), here), "contains its own visibility"),
         (lambda here: tracks_file({"model": "cotracker3"}, None, here), "model: expected an array of numbers"),
@@ -147,7 +147,7 @@ def test_no_temporary_file_remains(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_result_that_is_not_loaded_is_an_error(tmp_path: Path) -> None:
+def test_reading_a_result_before_load_is_an_error(tmp_path: Path) -> None:
     with Client("http://pliant.test", transport=InMemoryService()) as client:
         result = client.submit(POINTS).wait(timeout=9, load=False, folder=tmp_path)
         with pytest.raises(NotLoaded, match=r"call load\(\)"):

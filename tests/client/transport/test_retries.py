@@ -1,4 +1,4 @@
-"""Retries: only when needed, never with double effect, never endless."""
+"""Retries: only when needed, never with duplicate effects, never endless."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ POINTS = np.random.default_rng(0).normal(size=(4, 9, 2))
 
 
 class Clock:
-    """Time that passes only when somebody pauses."""
+    """Time that advances only during pauses."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -54,7 +54,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 class Flaky(InMemoryService):
-    """A service that misbehaves before, or after, it has done what it was asked."""
+    """A service that fails before, or after, it has handled a request."""
 
     def __init__(
         self, *faults: Callable[[httpx.Request], httpx.Response], after: bool = False, steps: float = 0
@@ -113,7 +113,7 @@ def test_a_lost_response_to_a_submission_creates_one_job(clock: Clock) -> None:
 def test_a_call_that_may_have_been_carried_out_is_not_repeated(clock: Clock) -> None:
     service = Flaky(cut_off)
     client = client_of(service, clock)
-    call = Call(method="POST", path="/v1/jobs/x/retry")  # without a key, as a client of another making might
+    call = Call(method="POST", path="/v1/jobs/x/retry")  # without a key, as another client might send it
     with pytest.raises(Unreachable, match="not sent again, because it may have been carried out"):
         client._exchange(None).record(call, Job)
     assert len(service.requests) == 1
@@ -161,7 +161,7 @@ def test_pauses_double_up_to_a_bound(clock: Clock) -> None:
     assert clock.pauses == [0.25, 0.5, 1, 2, 4, 8, 10, 10]
 
 
-def test_a_wrong_address_fails_within_seconds_and_a_restart_is_waited_for(clock: Clock) -> None:
+def test_a_wrong_address_fails_fast_but_a_restart_is_waited_for(clock: Clock) -> None:
     with pytest.raises(Unreachable, match=r"connection refused.*pliant up"):
         client_of(Flaky(*[no_connection] * 99), clock).options()
     assert 1 < clock.now < 6
@@ -177,7 +177,7 @@ def test_a_wrong_address_fails_within_seconds_and_a_restart_is_waited_for(clock:
 
 
 @pytest.mark.parametrize("status", [400, 401, 404, 409, 413, 422, 500, 501])
-def test_a_definite_rejection_is_not_repeated(clock: Clock, status: int) -> None:
+def test_a_non_retryable_error_is_not_retried(clock: Clock, status: int) -> None:
     service = Flaky(answer(status))
     with pytest.raises(Exception, match=r"Sentence\."):
         client_of(service, clock).options()
@@ -191,21 +191,21 @@ def test_a_retryable_error_is_retried(clock: Clock) -> None:
 
 
 @pytest.mark.parametrize(("status", "kind"), [(429, TooManyRequests), (503, ServiceFailed)])
-def test_a_service_that_never_recovers_raises_its_own_message(clock: Clock, status: int, kind: type) -> None:
+def test_persistent_errors_are_raised_with_the_services_message(clock: Clock, status: int, kind: type) -> None:
     with pytest.raises(kind, match=r"Sentence\.") as caught:
         client_of(Flaky(*[answer(status)] * 99), clock).options()
     assert caught.value.status == status
     assert 60 < clock.now <= 90
 
 
-def test_the_overall_timeout_holds_over_all_repetitions(clock: Clock) -> None:
+def test_the_timeout_covers_all_retries(clock: Clock) -> None:
     with pytest.raises(WaitTimeout, match="The timeout of 3 s passed") as caught:
         client_of(Flaky(*[answer(503)] * 99), clock).options(timeout=3)
     assert clock.now <= 3
     assert isinstance(caught.value, TimeoutError)
 
 
-def test_a_refusal_that_arrives_with_the_deadline_is_the_error(clock: Clock) -> None:
+def test_an_error_response_is_raised_even_after_the_deadline(clock: Clock) -> None:
     def late(request: httpx.Request) -> httpx.Response:
         clock.now += 5
         return answer(422)(request)

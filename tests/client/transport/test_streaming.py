@@ -21,7 +21,7 @@ from pliant.service.testing import InMemoryService
 
 SIZE = 64 * 2**20
 ROOM = 4 * 2**20
-"""Bytes of Python memory that moving the file may take at most."""
+"""Largest allowed Python memory for transferring the file, bytes."""
 
 PIECE = bytes(2**16)
 
@@ -37,7 +37,7 @@ class Body(httpx.SyncByteStream, httpx.AsyncByteStream):
 
 
 class Sink(httpx.BaseTransport, httpx.AsyncBaseTransport):
-    """Swallows what is sent, answers a file to a GET and a job to the rest."""
+    """Discards request bodies; answers a GET with a file and other requests with a job."""
 
     def __init__(self) -> None:
         self.received = 0
@@ -84,7 +84,7 @@ def memory() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def big(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    Client("http://pliant.test", transport=Sink()).submit([[[0, 0]] * 9] * 4)  # whatever is loaded at the first use
+    Client("http://pliant.test", transport=Sink()).submit([[[0, 0]] * 9] * 4)  # loads what the first use imports
     path = tmp_path_factory.mktemp("big") / "tracks.npz"
     with path.open("wb") as file:
         file.truncate(SIZE)
@@ -104,7 +104,7 @@ def attempts() -> Attempts:
 
 
 @pytest.mark.usefixtures("memory")
-def test_upload(big: Path) -> None:
+def test_uploads_are_streamed(big: Path) -> None:
     sink = Sink()
     Client("http://pliant.test", transport=sink).submit(big)
     assert sink.received > SIZE
@@ -112,7 +112,7 @@ def test_upload(big: Path) -> None:
 
 
 @pytest.mark.usefixtures("memory")
-def test_upload_asynchronously(big: Path) -> None:
+def test_async_uploads_are_streamed(big: Path) -> None:
     sink = Sink()
 
     async def send() -> None:
@@ -125,14 +125,14 @@ def test_upload_asynchronously(big: Path) -> None:
 
 
 @pytest.mark.usefixtures("memory")
-def test_download(artifact: Artifact, tmp_path: Path) -> None:
+def test_downloads_are_streamed(artifact: Artifact, tmp_path: Path) -> None:
     with httpx.Client(base_url="http://pliant.test", transport=Sink()) as http:
         path = download(Exchange(http, attempts()), "/file", artifact, tmp_path, on_download=None)
     assert path.stat().st_size == SIZE
 
 
 @pytest.mark.usefixtures("memory")
-def test_download_asynchronously(artifact: Artifact, tmp_path: Path) -> None:
+def test_async_downloads_are_streamed(artifact: Artifact, tmp_path: Path) -> None:
     async def fetch() -> Path:
         async with httpx.AsyncClient(base_url="http://pliant.test", transport=Sink()) as http:
             return await async_download(AsyncExchange(http, attempts()), "/file", artifact, tmp_path, on_download=None)

@@ -28,7 +28,7 @@ def small_is_large(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def breaking(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, int], list[int]]:
-    """Break the connection while a body is being sent: so many times, each after so many pieces; tell where each began."""
+    """Break the connection `times` times, each `after` pieces of the body; return the offset where each attempt began."""
 
     def arm(times: int, after: int) -> list[int]:
         began: list[int] = []
@@ -91,7 +91,7 @@ def test_bytes_sent_by_an_earlier_run_are_not_sent_again(
     assert whole[0] > 0, "it goes on where the first run was given up"
 
 
-def test_a_service_without_uploads_receives_one_request() -> None:
+def test_a_service_without_uploads_receives_a_single_post() -> None:
     class Older(InMemoryService):
         def handle_request(self, request: httpx.Request) -> httpx.Response:
             if "/uploads/" not in request.url.path:
@@ -132,11 +132,11 @@ def test_an_expired_upload_is_sent_again() -> None:
     assert caught.value.code == "unknown_upload"
 
 
-def test_a_deadline_that_passes_after_the_answer_does_not_hide_the_job() -> None:
+def test_a_job_is_returned_if_the_deadline_passes_with_the_response() -> None:
     now = 0.0
 
     class Late(InMemoryService):
-        """Its answer to the submission comes just before the deadline."""
+        """Its response to the submission arrives at the deadline."""
 
         def handle_request(self, request: httpx.Request) -> httpx.Response:
             nonlocal now
@@ -154,7 +154,7 @@ def test_a_deadline_that_passes_after_the_answer_does_not_hide_the_job() -> None
 
 def test_after_an_offset_mismatch_the_offset_is_read_again(tmp_path: Path) -> None:
     class Jumping(InMemoryService):
-        """Somebody else has written part of it in the meantime."""
+        """Another client has written part of the upload in the meantime."""
 
         jumped = False
 

@@ -1,6 +1,6 @@
-"""Every crafted file, sent to the real service over HTTP: refused by a code, the service alive, memory bounded, nothing left behind.
+"""Malicious files sent to a real service over HTTP: rejected with a code; it stays alive, bounds its memory and keeps nothing.
 
-`python tests/service/access/test_attacks.py` sends them once more and writes a table of the answers to build/attacks.md.
+`python tests/service/access/test_attacks.py` sends all of them and writes a table of the responses to build/attacks.md.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ DOCUMENT = ROOT / "build" / "attacks.md"
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory peaks are read from /proc")
 
 GROWTH = 48 << 20
-"""Most that the service may grow by for one file, bytes."""
+"""Largest allowed growth of the service's memory for one file, bytes."""
 
 CHILD = 2 << 30
-"""Most that a process which reads a file may take, bytes."""
+"""Largest allowed memory of a process that reads a file, bytes."""
 
 
 @dataclass(frozen=True)
 class House:
     http: httpx.Client
     service: int
-    """The process that answers HTTP."""
+    """Process id of the HTTP server."""
     incoming: Path
 
 
@@ -67,7 +67,7 @@ def opened(folder: Path) -> Iterator[House]:
         new = [pid for pid in descendants(os.getpid()) if pid not in before]
         service = next(pid for pid in new if b"pliant.service" in Path(f"/proc/{pid}/cmdline").read_bytes())
         honest = send(House(http, service, folder / "data" / "incoming"), Attack("honest", "", lambda: HONEST, ()))
-        assert honest.status == 202, honest.problem  # what reading needs is loaded now
+        assert honest.status == 202, honest.problem  # loads what reading needs before anything is measured
         yield House(http, service, folder / "data" / "incoming")
 
 

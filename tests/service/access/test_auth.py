@@ -1,4 +1,4 @@
-"""Tokens over real HTTP: who is let in, before what, and whose jobs he finds."""
+"""Tokens over real HTTP: authentication, scopes, and ownership of jobs."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def bob(guarded: Running) -> Iterator[httpx.Client]:
 
 
 def addresses(running: Running) -> list[tuple[str, str]]:
-    """Every method and path of the API, as FastAPI knows them, not as a list in a test does."""
+    """Return every method and path of the API, read from FastAPI so that no route is missed."""
     app = create_app(running.jobs, running.settings, tokens=running.tokens)
     found = [
         (method, path.replace("{id}", "nobody").replace("{name}", "face").replace("{file}", "tracks.npz"))
@@ -73,7 +73,7 @@ def test_every_path_but_the_public_ones_needs_a_token(guarded: Running) -> None:
             assert http.get(path).status_code == 200
 
 
-def test_a_token_in_the_query_is_ignored(guarded: Running) -> None:
+def test_tokens_in_the_query_or_sent_twice_are_not_accepted(guarded: Running) -> None:
     _, text = guarded.tokens.create("ada")
     for name in ("token", "access_token", "authorization"):
         assert httpx.get(f"{guarded.url}/v1/jobs", params={name: text}).status_code == 401
@@ -88,7 +88,7 @@ def test_a_valid_token_is_accepted(guarded: Running, scheme: str) -> None:
     assert (answer.status_code, answer.json()["jobs"]) == (200, [])
 
 
-def test_wrong_revoked_and_expired_tokens_have_codes_of_their_own(guarded: Running) -> None:
+def test_missing_invalid_revoked_and_expired_tokens_are_rejected(guarded: Running) -> None:
     token, text = guarded.tokens.create("gone")
     _, short = guarded.tokens.create("short", expires=timedelta(seconds=0.05))
     time.sleep(0.1)
@@ -106,7 +106,7 @@ def test_wrong_revoked_and_expired_tokens_have_codes_of_their_own(guarded: Runni
 
 
 def test_the_body_of_a_request_without_a_token_is_never_read(guarded: Running) -> None:
-    """The answer comes although not one byte of the body was sent, and nothing is written."""
+    """The response arrives before any byte of the body is sent, and nothing is written."""
     host, port = guarded.url.removeprefix("http://").split(":")
     head = (
         f"POST /v1/jobs HTTP/1.1\r\nHost: {host}:{port}\r\nContent-Type: multipart/form-data; boundary=b\r\n"
@@ -134,7 +134,7 @@ def test_a_scope_limits_what_a_token_can_do(guarded: Running, scopes: tuple[Scop
             assert 'error="insufficient_scope"' in answer.headers["www-authenticate"]
 
 
-def test_every_route_has_its_scope() -> None:
+def test_required_scopes_follow_from_method_and_path() -> None:
     assert needed("GET", "/metrics") is Scope.ADMIN
     assert needed("POST", "/v1/options") is Scope.SUBMIT
     assert needed("GET", "/v1/optionsextra") is Scope.READ
@@ -146,7 +146,7 @@ def test_every_route_has_its_scope() -> None:
     ] * 5
 
 
-def test_a_token_that_may_only_submit_sends_large_files(guarded: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_submit_only_token_can_upload_large_files(guarded: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pliant.client.multipart.RESUMABLE_BYTES", 1000)
     monkeypatch.setattr("pliant.client.multipart.SMALL", 1000)
     _, text = guarded.tokens.create("sender", scopes=(Scope.SUBMIT,))
@@ -156,7 +156,7 @@ def test_a_token_that_may_only_submit_sends_large_files(guarded: Running, monkey
     assert guarded.jobs.records.get(job.id).bytes > 1000
 
 
-def test_jobs_of_another_token_do_not_exist_on_any_route(
+def test_jobs_of_another_token_return_404_on_every_route(
     guarded: Running, ada: httpx.Client, bob: httpx.Client
 ) -> None:
     job = submit(ada, name="ada's")
@@ -210,7 +210,7 @@ def test_an_id_used_by_another_token_conflicts_without_revealing_its_job(
     assert refused(bob, tracks(seed=6)) == answer.text, "nor how it stands"
 
 
-def test_idempotency_keys_are_each_tokens_own(ada: httpx.Client, bob: httpx.Client) -> None:
+def test_idempotency_keys_are_scoped_to_a_token(ada: httpx.Client, bob: httpx.Client) -> None:
     parts = form(tracks(seed=4))
     key = {"Idempotency-Key": "one"}
     first, again, other = (each.post("/v1/jobs", files=parts, headers=key) for each in (ada, ada, bob))
@@ -218,7 +218,7 @@ def test_idempotency_keys_are_each_tokens_own(ada: httpx.Client, bob: httpx.Clie
     assert first.json()["id"] == again.json()["id"] != other.json()["id"]
 
 
-def test_admin_sees_all_jobs_and_a_sharing_token_those_of_its_owner(guarded: Running, ada: httpx.Client) -> None:
+def test_admins_see_all_jobs_and_sharing_tokens_those_of_their_owner(guarded: Running, ada: httpx.Client) -> None:
     job = submit(ada, name="seen")
     owner = guarded.jobs.records.get(job.id).owner
     with guarded.client(Scope.ADMIN) as admin, guarded.client(sharing=owner) as fellow:
@@ -251,7 +251,7 @@ def test_the_sdk_works_with_a_token_and_explains_a_missing_one(guarded: Running)
         stranger.get(job.id)
 
 
-def test_without_the_store_no_token_is_accepted(serve: Serve, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_no_token_is_valid_if_the_store_is_down(serve: Serve, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     running = serve(redis_url=f"unix://{tmp_path}/nobody.sock", auth="required")
     headers = {"Authorization": f"Bearer pliant_{'0' * 12}_{'a' * 43}"}
     answer = httpx.get(f"{running.url}/v1/limits", headers=headers, timeout=30)
@@ -278,7 +278,7 @@ def test_a_preflight_needs_no_token_and_errors_are_readable_across_origins(serve
     assert "access-control-allow-origin" not in strange.headers
 
 
-def test_tokens_are_off_on_loopback_and_on_elsewhere_by_default(valkey_url: str) -> None:
+def test_tokens_are_required_by_default_except_on_loopback(valkey_url: str) -> None:
     def asks(**env: str) -> bool:
         return settings_from(**env).asks_for_tokens
 
@@ -290,7 +290,7 @@ def test_tokens_are_off_on_loopback_and_on_elsewhere_by_default(valkey_url: str)
         asks(AUTH="no")
 
 
-def test_a_service_without_a_valid_token_does_not_start(valkey_url: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_public_service_without_tokens_does_not_start(valkey_url: str, caplog: pytest.LogCaptureFixture) -> None:
     tokens = Tokens(connect(valkey_url, decode=True), prefix="check-door")
     strict, open_door = ServiceSettings(host="0.0.0.0"), ServiceSettings(host="0.0.0.0", auth="off")
     with pytest.raises(InvalidSetting, match=r"pliant token create.*PLIANT_AUTH=off"):
@@ -304,7 +304,7 @@ def test_a_service_without_a_valid_token_does_not_start(valkey_url: str, caplog:
     process.check_access(strict, Tokens(connect("unix:///nonexistent/x.sock", decode=True, retries=0), prefix="x"))
 
 
-def test_with_tokens_off_a_sent_token_is_ignored(running: Running, http: httpx.Client, tmp_path: Path) -> None:
+def test_a_token_is_ignored_if_authentication_is_off(running: Running, http: httpx.Client, tmp_path: Path) -> None:
     job = submit(http, name="anybody's")
     assert http.get(f"/v1/jobs/{job.id}", headers={"Authorization": "Bearer nonsense"}).status_code == 200
     assert Jobs.open(Settings(data=tmp_path / "x", redis_url="unix:///x")).owner is None

@@ -1,4 +1,4 @@
-"""Headers of every answer, and the hosts that are accepted."""
+"""Security headers of every response, and the accepted hosts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def user(guarded: Running) -> Iterator[httpx.Client]:
         yield client
 
 
-def test_every_kind_of_answer_has_the_security_headers(guarded: Running, user: httpx.Client) -> None:
+def test_every_kind_of_response_has_the_security_headers(guarded: Running, user: httpx.Client) -> None:
     job = submit(user)
     finish(guarded, job.id, b"result")
     file = f"/v1/jobs/{job.id}/artifacts/shapes.npz"
@@ -74,14 +74,14 @@ def test_every_kind_of_answer_has_the_security_headers(guarded: Running, user: h
         ("127.0.0.1@evil.example", 421),
     ],
 )  # fmt: skip
-def test_on_loopback_only_its_own_names_are_answered(running: Running, host: str, status: int) -> None:
+def test_on_loopback_only_loopback_hosts_are_accepted(running: Running, host: str, status: int) -> None:
     answer = httpx.get(f"{running.url}/v1/limits", headers={"Host": host})
     assert answer.status_code == status
     if status == 421:
         assert answer.json()["code"] == "unknown_host"
 
 
-def test_a_list_of_hosts_is_complete(serve: Serve) -> None:
+def test_only_the_listed_hosts_are_accepted(serve: Serve) -> None:
     running = serve(allowed_hosts=("Pliant.example:443",))  # as a Host header may spell it
     for host, status in (
         ("pliant.example", 200),
@@ -92,12 +92,12 @@ def test_a_list_of_hosts_is_complete(serve: Serve) -> None:
         assert httpx.get(f"{running.url}/healthz", headers={"Host": host}).status_code == status
 
 
-def test_on_another_address_any_name_is_answered_unless_there_is_a_list(serve: Serve) -> None:
+def test_any_host_is_accepted_off_loopback_without_a_host_list(serve: Serve) -> None:
     running = serve(host="0.0.0.0")  # the setting; the test binds 127.0.0.1
     assert httpx.get(f"{running.url}/healthz", headers={"Host": "anything.example"}).status_code == 200
 
 
-def test_an_internal_error_reveals_nothing_and_is_logged_and_counted(
+def test_internal_errors_hide_details_and_are_logged_and_counted(
     serve: Serve, caplog: pytest.LogCaptureFixture
 ) -> None:
     running = serve()

@@ -1,4 +1,4 @@
-"""Limits of one client: requests, queued jobs, size of a body; and the answers beyond them."""
+"""Limits per client: request rate, queued and running jobs, body size; and the responses beyond them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_burst_of_one_minute_is_allowed_then_the_steady_rate() -> None:
     assert [rates.take("a", 60) == 0.0 for _ in range(61)] == [True] * 60 + [False], "idleness is not saved up"
 
 
-def test_over_a_long_time_the_rate_is_the_configured_one() -> None:
+def test_the_long_term_rate_is_the_configured_rate() -> None:
     clock = Clock()
     rates = Rates(clock=clock)
     passed = 0
@@ -52,7 +52,7 @@ def test_over_a_long_time_the_rate_is_the_configured_one() -> None:
     assert 10 * 30 <= passed <= 11 * 30 + 1
 
 
-def test_the_number_of_remembered_clients_is_bounded_and_busy_ones_are_kept() -> None:
+def test_remembered_clients_are_bounded_and_busy_ones_are_kept() -> None:
     clock = Clock()
     rates = Rates(clock=clock)
     while rates.take("greedy", 10) == 0.0:
@@ -63,7 +63,7 @@ def test_the_number_of_remembered_clients_is_bounded_and_busy_ones_are_kept() ->
     assert rates.take("greedy", 10) > 0
 
 
-def test_an_address_is_one_client_and_so_is_an_ipv6_network() -> None:
+def test_clients_are_counted_by_ipv4_address_or_ipv6_network() -> None:
     def who(host: str) -> str:
         return _client({"client": (host, 1)}, None)
 
@@ -73,7 +73,7 @@ def test_an_address_is_one_client_and_so_is_an_ipv6_network() -> None:
     assert _client({"client": None}, None) == ""
 
 
-def test_too_many_requests_are_refused_with_the_time_to_wait_and_before_the_body(serve: Serve) -> None:
+def test_too_many_requests_return_429_with_retry_after(serve: Serve) -> None:
     running = serve(requests_per_minute=5)
     with httpx.Client(base_url=running.url) as http:
         for _ in range(5):
@@ -176,7 +176,7 @@ def test_a_token_can_have_a_smaller_body_limit(serve: Serve) -> None:
         submit(large)
 
 
-def test_the_default_rate_applies_where_the_service_is_reachable_from_outside() -> None:
+def test_the_default_rate_limit_applies_off_loopback_or_with_tokens() -> None:
     def rate(own: int | None = None, **env: str) -> int:
         return settings_from(**env).rate_of(own)
 
@@ -198,7 +198,7 @@ def test_jobs_above_the_running_limit_are_held_back(serve: Serve) -> None:
         assert places == [0, None, 1, 2], "null: held back"
 
 
-def test_jobs_of_an_admin_count_for_no_owner(serve: Serve) -> None:
+def test_admin_jobs_have_their_own_queue_limit(serve: Serve) -> None:
     running: Running = serve(auth="required", max_queued=1)
     with running.client() as ada, running.client(Scope.ADMIN) as admin:
         submit(ada)
@@ -206,8 +206,8 @@ def test_jobs_of_an_admin_count_for_no_owner(serve: Serve) -> None:
         assert admin.post("/v1/jobs", files=form()).status_code == 429
 
 
-def test_the_address_of_a_client_is_its_own_unless_a_proxy_is_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Any user of the machine could otherwise choose the address that is counted, and so pass the limit."""
+def test_proxy_headers_are_ignored_unless_a_proxy_is_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise any local user could spoof the counted address and evade the limit."""
     configured: list[uvicorn.Config] = []
 
     class Recorded(main.Server):

@@ -12,7 +12,7 @@ from serving import Running, Serve, finish, submit
 
 @pytest.fixture(params=["off", "required"])
 def guarded(request: pytest.FixtureRequest, serve: Serve) -> Running:
-    """A service without tokens, and one that requires them: a link opens the same in both."""
+    """A service without tokens, and one that requires them: share links grant the same on both."""
     return serve(auth=request.param)
 
 
@@ -25,7 +25,7 @@ def shared(running: Running, http: httpx.Client, **body: int) -> tuple[str, str,
     return id, token, httpx.Client(base_url=running.url, headers={"Authorization": f"Bearer {token}"}, timeout=20)
 
 
-def test_a_link_reads_its_job_and_nothing_else(guarded: Running) -> None:
+def test_a_share_link_grants_read_access_to_its_job_only(guarded: Running) -> None:
     with guarded.client(name="owner") as http:
         id, _, guest = shared(guarded, http)
         other = submit(http).id
@@ -52,7 +52,7 @@ def test_a_link_reads_its_job_and_nothing_else(guarded: Running) -> None:
                 assert (answer.status_code, answer.json()["code"]) == (403, "beyond_share"), (method, path)
 
 
-def test_a_link_ends_by_expiry_revocation_and_deletion(running: Running, http: httpx.Client) -> None:
+def test_share_links_end_on_expiry_revocation_or_job_deletion(running: Running, http: httpx.Client) -> None:
     id, _, guest = shared(running, http, expires_in=60)
     with guest:
         past = datetime.now(UTC) - timedelta(seconds=1)
@@ -80,7 +80,7 @@ def test_a_link_ends_by_expiry_revocation_and_deletion(running: Running, http: h
         assert (gone.status_code, gone.json()["code"]) == (401, "invalid_share")
 
 
-def test_a_token_that_was_changed_is_no_token(running: Running, http: httpx.Client) -> None:
+def test_tampered_share_tokens_are_rejected(running: Running, http: httpx.Client) -> None:
     id, token, guest = shared(running, http)
     guest.close()
     other = submit(http).id
@@ -97,7 +97,7 @@ def test_a_token_that_was_changed_is_no_token(running: Running, http: httpx.Clie
     assert secret not in stored, "only its digest is stored"
 
 
-def test_who_may_share_and_how_often(serve: Serve) -> None:
+def test_only_owners_can_share_finished_jobs_up_to_a_limit(serve: Serve) -> None:
     running = serve(auth="required")
     with running.client(name="owner") as http, running.client(name="stranger") as stranger:
         id, _, guest = shared(running, http)
@@ -123,7 +123,7 @@ BODIES = {
 
 
 @pytest.mark.parametrize("case", BODIES)
-def test_bodies_that_are_refused(running: Running, http: httpx.Client, case: str) -> None:
+def test_invalid_bodies_for_shares_and_outputs_are_rejected(running: Running, http: httpx.Client, case: str) -> None:
     body, kind, status, code = BODIES[case]
     for path in ("shares", "outputs"):
         answer = http.post(f"/v1/jobs/none/{path}", content=body, headers={"Content-Type": kind})

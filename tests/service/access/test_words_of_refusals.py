@@ -1,4 +1,4 @@
-"""The exact words of the service's refusals, as a user of the page, the SDK or HTTP sees them."""
+"""The exact error messages of the service, as users of the page, the SDK or HTTP see them."""
 
 # ruff: noqa: E501
 from __future__ import annotations
@@ -28,7 +28,7 @@ FILM = ("film.mp4", b"\0\0\0\x18ftypmp42")
 
 
 def form(**parts: Any) -> dict[str, Any]:
-    """A form: texts as texts, pairs as files."""
+    """Return a form: strings as text parts, pairs as files."""
     return {"files": {name: (None, part) if isinstance(part, str) else part for name, part in parts.items()}}
 
 
@@ -65,7 +65,7 @@ REQUESTS: dict[str, tuple[Request, str]] = {
     "an unknown upload": (("POST", "/v1/jobs", form(tracks_upload="nothing")),
         "tracks_upload: expected the id of an upload, got 'nothing'. PUT it to /v1/uploads/nothing first; uploads that are not used expire."),
     "an upload that is not complete": (("POST", "/v1/jobs", form(tracks_upload="part")),
-        "tracks_upload: expected a complete upload, got a part of it. Send the rest first, from the offset that HEAD returns."),
+        "tracks_upload: expected a complete upload, got an incomplete one. Send the rest first, from the offset that HEAD returns."),
     "kept inputs and files": (("POST", "/v1/jobs", form(inputs_of="done", tracks=TRACKS)),
         "inputs_of: expected either inputs_of or files, got inputs_of and tracks. Leave one of them out."),
     "kept inputs read in another way": (("POST", "/v1/jobs", form(inputs_of="done", options='{"frames": "0:4"}')),
@@ -115,7 +115,7 @@ REQUESTS: dict[str, tuple[Request, str]] = {
     "retrying a running job": (("POST", "/v1/jobs/running/retry", {}),
         "Job 'running' has the status running: it cannot be run again now. Wait until it ends, or cancel it first."),
     "retrying a job with a result": (("POST", "/v1/jobs/done/retry", {}),
-        "Job 'done' has the status succeeded: it cannot be run again now. It has its result."),
+        "Job 'done' has the status succeeded: it cannot be run again now. It already has a result."),
     "sharing a running job": (("POST", "/v1/jobs/running/shares", {"json": {}}),
         "Job 'running' has the status running: it cannot be shared now. Wait until it has succeeded."),
     "sharing for a second": (("POST", "/v1/jobs/done/shares", {"json": {"expires_in": 1}}),
@@ -123,7 +123,7 @@ REQUESTS: dict[str, tuple[Request, str]] = {
     "a share that there is not": (("DELETE", "/v1/jobs/done/shares/nothing", {}),
         "Job 'done' has no share link 'nothing'; it may have expired. List the links to see which there are."),
     "outputs of a running job": (("POST", "/v1/jobs/running/outputs", {"json": {"outputs": ["glb"]}}),
-        "Job 'running' has the status running: it cannot be written in further files now. Wait until it has succeeded."),
+        "Job 'running' has the status running: it cannot be exported to further files now. Wait until it has succeeded."),
     "outputs of another kind": (("POST", "/v1/jobs/done/outputs", {"json": {"outputs": ["fbx"]}}),
         "outputs.0: expected 'glb', 'ply', 'obj', 'usd', 'abc', 'mdd', 'mat' or 'csv', got 'fbx'. Compare with the schema at /docs."),
     "no outputs": (("POST", "/v1/jobs/done/outputs", {"json": {"outputs": []}}),
@@ -152,7 +152,7 @@ REQUESTS: dict[str, tuple[Request, str]] = {
 
 
 @pytest.mark.parametrize("name", REQUESTS)
-def test_the_words_of_a_refused_request(http: httpx.Client, name: str) -> None:
+def test_rejected_requests_have_the_exact_message(http: httpx.Client, name: str) -> None:
     (method, path, more), words = REQUESTS[name]
     answer = http.request(method, path, **more)
     assert (answer.is_error, answer.json()["detail"]) == (True, words)
@@ -168,11 +168,11 @@ ERRORS: dict[str, tuple[Exception, str]] = {
     "a directory in use": (errors.DataDirectoryInUse("/srv/pliant", holder="process 7"), "/srv/pliant is already used by process 7. Stop it first, or choose another directory (--data)."),
     "a job out of time": (errors.TimedOut(60.0), "The job exceeded its option time_limit of 60 s. Raise it, send fewer points or frames, or lower max_reweightings."),
     "an unknown token": (errors.UnknownToken("t1"), "There is no token 't1'. `pliant token list` lists all tokens."),
-    "newer data": (errors.NewerData(found=9, known=3), "The records were written by a newer Pliant (version 9 of their form; this one reads up to 3). Install that Pliant, or restore a backup that was made before the upgrade."),
+    "newer data": (errors.NewerData(found=9, known=3), "The records were written by a newer Pliant (record format 9; this version reads up to 3). Install that Pliant, or restore a backup that was made before the upgrade."),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ERRORS)
-def test_the_words_of_a_limit(name: str) -> None:
+def test_worker_errors_have_the_exact_message(name: str) -> None:
     error, words = ERRORS[name]
     assert str(error) == words

@@ -1,4 +1,4 @@
-"""The alert rules fire on faults of a live service, and the dashboard's queries have values on its /metrics."""
+"""Alert rules fire on faults of a live service, and its /metrics has values for every dashboard query."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ DEPLOY = Path(__file__).parents[3] / "deploy"
 RULES: list[dict[str, Any]] = yaml.safe_load((DEPLOY / "prometheus" / "alerts.yml").read_text())["groups"][0]["rules"]
 PANELS = json.loads((DEPLOY / "grafana" / "pliant.json").read_text())["panels"]
 EVERY = 15.0
-"""Seconds between two scrapes, as Prometheus counts them; the test does not wait for them."""
+"""Seconds between two scrapes on the simulated clock; the test does not wait for them."""
 
 
 class Observer:
-    """Scrapes a live service on a clock of its own, and evaluates the rules each time, as Prometheus does."""
+    """Scrapes a live service on a simulated clock and evaluates the rules each time, as Prometheus does."""
 
     def __init__(self, http: httpx.Client) -> None:
         self.http, self.prometheus, self.now = http, Prometheus(), 0.0
@@ -47,7 +47,7 @@ class Observer:
 
 @contextmanager
 def worker(running: Running, log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Run one worker, which nothing restarts."""
+    """Run one worker without a supervisor that would restart it."""
     env = {**os.environ, **running.jobs.settings.to_environment(), "PLIANT_THREADS": "1"}
     with log.open("ab") as out:
         process = subprocess.Popen([sys.executable, "-m", "pliant.worker", "work"], env=env, stderr=out)
@@ -117,7 +117,7 @@ def test_an_unreachable_store_fires_its_alert(serve: Serve) -> None:
         assert "PliantStoreDown" in observer.look(5)
 
 
-def test_alerts_that_need_load_fire_on_what_metrics_say() -> None:
+def test_load_dependent_alerts_fire_on_synthetic_metrics() -> None:
     prometheus = Prometheus()
     told = (
         'pliant_http_requests_total{{status="200"}} {ok}\npliant_http_requests_total{{status="503"}} {failed}\n'
@@ -133,7 +133,7 @@ def test_alerts_that_need_load_fire_on_what_metrics_say() -> None:
     assert firing == {"PliantErrors", "PliantSlow", "PliantWebhooksFail", "PliantQueueStuck"}
 
 
-def test_the_evaluation_follows_prometheus() -> None:
+def test_the_rule_evaluator_follows_prometheus_semantics() -> None:
     prometheus = Prometheus()
     for at, counts in ((0, (5, 1)), (60, (7, 2)), (120, (1, 4))):  # the first counter is reset at 120 s
         text = "\n".join(f'c_total{{k="{k}"}} {n}' for k, n in zip("ab", counts, strict=True))

@@ -22,7 +22,7 @@ def at_info(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
 
 
-def test_a_request_keeps_its_id_and_its_line_names_the_job(
+def test_request_ids_are_kept_and_access_log_lines_name_the_job(
     http: httpx.Client, caplog: pytest.LogCaptureFixture
 ) -> None:
     answer = http.get("/v1/options", headers={"X-Request-ID": "from-proxy:7"})
@@ -38,13 +38,13 @@ def test_a_request_keeps_its_id_and_its_line_names_the_job(
 
 
 @pytest.mark.parametrize("id", ["a b", "x" * 129, "a\tb", "naïve"])
-def test_an_unfit_request_id_is_replaced(http: httpx.Client, id: str) -> None:
+def test_an_invalid_request_id_is_replaced(http: httpx.Client, id: str) -> None:
     answer = http.get("/healthz", headers={"X-Request-ID": id.encode()})
     assert answer.headers["x-request-id"] != id
     assert len(answer.headers["x-request-id"]) == 16
 
 
-def test_a_refusal_is_logged_with_its_code_and_without_the_query(
+def test_rejections_are_logged_with_their_code_and_without_secrets(
     http: httpx.Client, caplog: pytest.LogCaptureFixture
 ) -> None:
     http.get("/v1/jobs/nobody-here?token=SECRET", headers={"Authorization": "Bearer SECRET"})
@@ -101,7 +101,7 @@ def test_json_lines_carry_every_field() -> None:
     }  # fmt: skip
 
 
-def test_level_and_format_are_set_once_for_the_process(capsys: pytest.CaptureFixture[str]) -> None:
+def test_configure_logging_sets_level_and_format(capsys: pytest.CaptureFixture[str]) -> None:
     root = logging.getLogger()
     before, level = root.handlers[:], root.level
     try:

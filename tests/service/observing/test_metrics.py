@@ -1,4 +1,4 @@
-"""The numbers at /metrics, read by Prometheus' own parser."""
+"""The values at /metrics, read by Prometheus' own parser."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def at(numbers: Numbers, name: str, **labels: str) -> float:
     return numbers.get((name, tuple(sorted(labels.items()))), 0.0)
 
 
-def test_the_metrics_count_what_happened(serve: Serve) -> None:
+def test_metrics_count_jobs_and_requests(serve: Serve) -> None:
     running: Running = serve()
     with httpx.Client(base_url=running.url) as http:
         before = read(http.get("/metrics").text)
@@ -78,7 +78,7 @@ def test_the_metrics_count_what_happened(serve: Serve) -> None:
     assert "nobody" not in answer.text, "addresses are strangers' text"
 
 
-def test_only_an_admins_token_may_read_them(serve: Serve) -> None:
+def test_metrics_require_the_admin_scope(serve: Serve) -> None:
     running = serve(auth="required")
     assert httpx.get(f"{running.url}/metrics").status_code == 401
     with running.client() as user, running.client(Scope.ADMIN) as admin:
@@ -88,7 +88,7 @@ def test_only_an_admins_token_may_read_them(serve: Serve) -> None:
     assert at(numbers, "pliant_http_requests_total", method="GET", route="other", status="403") == 1
 
 
-def test_without_its_store_the_service_reports_its_requests(serve: Serve, tmp_path: Path) -> None:
+def test_metrics_report_an_unreachable_store(serve: Serve, tmp_path: Path) -> None:
     running = serve(redis_url=f"unix://{tmp_path}/nobody.sock")
     answer = httpx.get(f"{running.url}/metrics", timeout=30)
     assert answer.status_code == 200
@@ -97,14 +97,14 @@ def test_without_its_store_the_service_reports_its_requests(serve: Serve, tmp_pa
     assert ("pliant_queue_depth", ()) not in numbers
 
 
-def test_unusual_methods_and_labels_are_counted(running: Running) -> None:
+def test_unknown_methods_count_as_other_and_labels_are_escaped(running: Running) -> None:
     metrics = Metrics()
     metrics.count("BREW", 'a"b\\c\nd', status=418, seconds=0.1)
     numbers = read(metrics.exposition(running.jobs).decode())
     assert at(numbers, "pliant_http_requests_total", method="other", route='a"b\\c\nd', status="418") == 1
 
 
-def test_the_oldest_waiting_job_is_the_oldest(running: Running, http: httpx.Client) -> None:
+def test_oldest_returns_when_the_first_queued_job_was_created(running: Running, http: httpx.Client) -> None:
     submit(http, name="first or later")
     submit(http, name="later")
     oldest = running.jobs.records.oldest(Status.QUEUED)

@@ -1,4 +1,4 @@
-"""The dashboard and the alert rules ask for metrics and labels that /metrics has."""
+"""The dashboard and the alert rules query only metrics and labels that /metrics exports."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def queries() -> list[str]:
     return [rule["expr"] for rule in rules] + [target["expr"] for panel in panels for target in panel["targets"]]
 
 
-def test_every_query_names_metrics_and_labels_that_exist(running: Running, http: httpx.Client) -> None:
+def test_every_query_uses_existing_metrics_and_labels(running: Running, http: httpx.Client) -> None:
     finish(running, submit(http, name="done").id, b"x")
     failed = submit(http, name="failed")
     attempt = claim(running, failed.id)
@@ -59,7 +59,7 @@ def test_every_query_names_metrics_and_labels_that_exist(running: Running, http:
                 assert {each.strip() for each in group.split(",")} <= labels[name], query
 
 
-def test_every_metric_is_shown_on_the_dashboard(http: httpx.Client) -> None:
+def test_every_metric_is_used_by_the_dashboard_or_an_alert(http: httpx.Client) -> None:
     shown = {re.sub(r"_(bucket|total)$", "", name) for query in queries() for name, _ in SELECTOR.findall(query)}
     served = {family.name for family in text_string_to_metric_families(http.get("/metrics").text)}
     assert served == shown

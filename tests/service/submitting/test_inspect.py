@@ -30,7 +30,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", GOOD)
-def test_inspection_equals_the_interpretation_of_the_job_and_creates_none(
+def test_inspection_returns_the_interpretation_without_creating_a_job(
     running: Running, http: httpx.Client, case: str
 ) -> None:
     before = running.waiting
@@ -56,7 +56,7 @@ def test_the_sample_is_the_tracks_upright_and_to_scale(http: httpx.Client) -> No
         sample = np.array(answer.json()["sample"]).reshape(4, 9, 2)
         np.testing.assert_array_equal(sample[2, 4], [-1, -1])
         scale = (sample[0, 1] - sample[0, 0])[0] / 40
-        assert 15 < scale < 25  # 49 units wide, and a tenth of the square to spare
+        assert 15 < scale < 25  # 49 units wide, with a margin of a tenth of the square
         np.testing.assert_allclose(sample[0] - sample[0, 0], scale * corners * (1, sign), atol=2)
         np.testing.assert_allclose(sample[3] - sample[0], np.tile([9 * scale, 0], (9, 1)), atol=2)
         assert sample[sample >= 0].max() <= 1000
@@ -65,7 +65,7 @@ def test_the_sample_is_the_tracks_upright_and_to_scale(http: httpx.Client) -> No
 @pytest.mark.parametrize("size", [(3, 2000), (500, 9)])
 def test_the_sample_is_small_for_any_input(http: httpx.Client, size: tuple[int, int]) -> None:
     points = np.random.default_rng(3).normal(size=(*size, 2))
-    points[0, 0] = 1e9  # one outlier does not make the rest a dot
+    points[0, 0] = 1e9  # one outlier must not shrink the rest to a dot
     sample = http.post("/v1/inspect", files=form(npz(tracks=points), mesh="none")).json()["sample"]
     assert len(sample) == min(size[0], 16)
     assert {len(frame) for frame in sample} == {2 * min(size[1], 200)}

@@ -14,7 +14,7 @@ FRAMES, ROWS, COLUMNS = 6, 4, 5
 
 @pytest.fixture
 def film_tracks() -> bytes:
-    """A file as `pliant track` writes it: it states the picture's size and the film's rate."""
+    """A file as `pliant track` writes it, with the image size and the frame rate."""
     grid = np.arange(ROWS * COLUMNS, dtype=np.int32).reshape(ROWS, COLUMNS)
     start = 20.0 * np.stack(np.unravel_index(np.arange(ROWS * COLUMNS), grid.shape), axis=1)[:, ::-1] + 30
     tracks = start + np.random.default_rng(0).normal(size=(FRAMES, ROWS * COLUMNS, 2))
@@ -30,7 +30,7 @@ def again(http: httpx.Client, job: Job, **headers: str) -> httpx.Response:
     return http.post("/v1/jobs", files=parts, headers=headers)
 
 
-def test_what_the_file_states_counts_again(running: Running, http: httpx.Client, film_tracks: bytes) -> None:
+def test_a_rerun_keeps_image_size_and_fps_of_the_file(running: Running, http: httpx.Client, film_tracks: bytes) -> None:
     first = submit(http, body=film_tracks)
     finish(running, first.id, b"x")
     second = Job.model_validate_json(again(http, first).content)
@@ -39,14 +39,14 @@ def test_what_the_file_states_counts_again(running: Running, http: httpx.Client,
     assert second.options.loss == "huber"
 
 
-def test_the_estimate_is_that_of_the_new_options(running: Running, http: httpx.Client) -> None:
+def test_a_rerun_is_estimated_with_its_new_options(running: Running, http: httpx.Client) -> None:
     first = submit(http)
     finish(running, first.id, b"x")
     second = Job.model_validate_json(again(http, first).content)
     assert second.interpretation.estimate == estimated(6, 12, second.options) != first.interpretation.estimate
 
 
-def test_a_repeated_request_finds_its_job_when_the_earlier_one_is_gone(running: Running, http: httpx.Client) -> None:
+def test_a_repeated_rerun_finds_its_job_after_the_original_is_deleted(running: Running, http: httpx.Client) -> None:
     first = submit(http)
     finish(running, first.id, b"x")
     second = again(http, first, **{"Idempotency-Key": "once"})
@@ -56,7 +56,7 @@ def test_a_repeated_request_finds_its_job_when_the_earlier_one_is_gone(running: 
     assert again(http, first).json()["code"] == "unknown_job"
 
 
-def test_options_that_contradict_each_other_are_refused(running: Running, http: httpx.Client) -> None:
+def test_a_rerun_with_contradictory_options_is_rejected(running: Running, http: httpx.Client) -> None:
     first = submit(http)
     finish(running, first.id, b"x")
     parts = {"inputs_of": (None, first.id), "options": (None, '{"focal": 900, "field_of_view": 60}')}
@@ -74,7 +74,7 @@ def test_options_that_contradict_each_other_are_refused(running: Running, http: 
         ({"order": "any", "prior": "smooth"}, "order"),
     ],
 )
-def test_contradictions_are_refused_before_anything_is_queued(
+def test_contradictory_options_are_rejected_before_queueing(
     running: Running, http: httpx.Client, path: str, options: dict[str, object], field: str
 ) -> None:
     before = running.waiting

@@ -88,7 +88,7 @@ def test_an_error_states_expected_and_got_and_nothing_is_kept(running: Running, 
     assert running.left_on_disk == []
 
 
-def test_a_file_that_cannot_be_written_here_is_refused_before_the_job_is_queued(
+def test_unavailable_outputs_are_rejected_before_the_job_is_queued(
     running: Running, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wish = form(options={"outputs": ["usd"]})
@@ -138,7 +138,7 @@ def small(serve: Serve) -> Running:
     return serve(max_body_mb=0.2, limits=Limits(max_frames=10))
 
 
-def test_a_body_beyond_the_limit_is_refused_however_it_is_sent(small: Running) -> None:
+def test_a_body_over_the_limit_is_rejected_chunked_or_not(small: Running) -> None:
     body = form(b"x" * 30_000_000)
     for chunked in (False, True):
         request = httpx.Request("POST", f"{small.url}/v1/jobs", files=body)
@@ -153,7 +153,7 @@ def test_a_body_beyond_the_limit_is_refused_however_it_is_sent(small: Running) -
     assert small.waiting == 0
 
 
-def test_the_readers_limits_are_the_services(small: Running) -> None:
+def test_the_input_limits_of_the_service_apply(small: Running) -> None:
     answer = httpx.post(f"{small.url}/v1/jobs", files=form(tracks(11)))
     assert (answer.status_code, answer.json()["code"]) == (422, "too_large")
 
@@ -178,7 +178,7 @@ def test_a_stalled_body_is_rejected(serve: Serve) -> None:
     assert hasty.left_on_disk == []
 
 
-def test_nothing_is_kept_of_a_client_that_disconnects(running: Running, caplog: pytest.LogCaptureFixture) -> None:
+def test_nothing_is_stored_if_the_client_disconnects(running: Running, caplog: pytest.LogCaptureFixture) -> None:
     connection = _begun(running.url, declared=10_000_000, sent=b"x" * 3_000_000)
     until(lambda: any(path.is_file() and path.stat().st_size > 0 for path in running.left_on_disk))
     connection.close()
@@ -225,7 +225,7 @@ def test_twenty_concurrent_repetitions_create_one_job(running: Running) -> None:
     assert len(set(found)) == 1
 
 
-def test_put_takes_the_clients_id(http: httpx.Client) -> None:
+def test_put_uses_the_id_chosen_by_the_client(http: httpx.Client) -> None:
     first = http.put("/v1/jobs/my-own-id", files=form(name="mine"))
     assert (first.status_code, first.json()["id"]) == (202, "my-own-id")
     again = http.put("/v1/jobs/my-own-id", files=form(name="mine"))
@@ -237,7 +237,7 @@ def test_put_takes_the_clients_id(http: httpx.Client) -> None:
     assert http.put("/v1/jobs/a%2Fb", files=form()).status_code == 404
 
 
-def test_pages_hold_every_job_once_newest_first(serve: Serve) -> None:
+def test_pages_list_every_job_once_newest_first(serve: Serve) -> None:
     running = serve()
     with httpx.Client(base_url=running.url) as http:
         ids = [submit(http).id for _ in range(5)]
@@ -264,7 +264,7 @@ def test_pages_hold_every_job_once_newest_first(serve: Serve) -> None:
             assert (answer.status_code, answer.json()["code"]) == (422, code)
 
 
-def test_cancel_retry_delete_follow_the_status(running: Running, http: httpx.Client) -> None:
+def test_cancel_retry_and_delete_depend_on_the_status(running: Running, http: httpx.Client) -> None:
     job = submit(http)
     assert http.delete(f"/v1/jobs/{job.id}").status_code == 409
     assert http.post(f"/v1/jobs/{job.id}/retry").json()["code"] == "not_allowed_now"

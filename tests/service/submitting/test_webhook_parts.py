@@ -12,7 +12,7 @@ SECRET = "whsec_" + base64.b64encode(b"s" * 32).decode()
 PARTS = {"webhook": "https://hooks.example/x?token=private", "webhook_secret": SECRET}
 
 
-def test_a_webhook_is_kept_with_the_job_and_shown_nowhere(running: Running, http: httpx.Client) -> None:
+def test_a_webhook_is_stored_with_the_job_and_never_shown(running: Running, http: httpx.Client) -> None:
     answer = http.post("/v1/jobs", files=form(**PARTS))
     assert answer.status_code == 202, answer.text
     id = answer.json()["id"]
@@ -48,7 +48,7 @@ def test_an_invalid_webhook_is_rejected_at_submission(
     assert running.waiting == before
 
 
-def test_a_repeated_request_with_another_webhook_is_another_request(http: httpx.Client) -> None:
+def test_an_idempotency_key_conflicts_if_the_webhook_differs(http: httpx.Client) -> None:
     body, key = tracks(seed=9), {"Idempotency-Key": "hooked"}
     first = http.post("/v1/jobs", files=form(body, **PARTS), headers=key)
     assert http.post("/v1/jobs", files=form(body, **PARTS), headers=key).json()["id"] == first.json()["id"]

@@ -1,7 +1,7 @@
-// One moving surface (or cloud of points): two frames on the graphics card, mixed by the shader.
+// One moving surface or point cloud: two frames on the graphics card, interpolated by the shader.
 //
-// Only the two frames around the present moment are uploaded, 16 bytes a point and frame: for 99 frames of 29,000 points that
-// is 1 MB on the card instead of the 46 MB that 99 morph targets take there, and a frame costs one mix instead of a loop over targets.
+// Only the two frames around the current time are uploaded, 16 bytes per point and frame: for 99 frames of 29,000 points, 1 MB
+// instead of 46 MB for 99 morph targets, and drawing takes one interpolation instead of a loop over the targets.
 
 import {
   BufferAttribute,
@@ -34,10 +34,10 @@ void main() {
   gl_PointSize = dot_size;
 }`;
 
-// A warm light from the upper left, a weak cool one from the right, more sky than ground, and a rim: all fixed to the viewer.
-// Both sides of a surface are lit, the back less. Positions without a value are grey; towards them the colour of their
-// neighbours fades to grey and does not pass through the dark end of the scale. The film's picture has its own light in it and is
-// shaded little.
+// A warm light from the upper left, a weak cool one from the right, ambient light brighter from above, and a rim: all fixed to
+// the viewer. Both sides of a surface are lit, the back less. Positions without a value are grey; the colours of their
+// neighbours fade directly to grey, not through the dark end of the scale. The film's picture already contains lighting and is
+// shaded only slightly.
 const FRAGMENT = `
 uniform vec3 plain; uniform vec3 scale[6]; uniform float coloured; uniform float lit; uniform float reversed;
 uniform sampler2D picture; uniform float pictured;
@@ -109,7 +109,7 @@ export class Body {
     this.group.add(this.wire);
   }
 
-  /** Show the moment `time`, in frames, between 0 and F − 1. */
+  /** Show the time `time`, in frames, between 0 and F − 1. */
   show(time: number): void {
     const last = Math.max(0, this.preview.ready - 1);
     const first = Math.min(Math.floor(time), last);
@@ -131,7 +131,7 @@ export class Body {
     for (const material of this.materials) material.uniforms["mixing"]!.value = second > first ? time - first : 0;
   }
 
-  /** Colour by values, by the film's picture, or plainly. */
+  /** Colour by values, by the film's picture, or with the plain colour. */
   colour(values: Values | null, picture: Picture | null = null): void {
     this.values = values;
     this.texture?.dispose();
@@ -147,13 +147,13 @@ export class Body {
     for (const name of ["coloured", "pictured"]) this.wire.material.uniforms[name]!.value = 0;
   }
 
-  /** The plain colour and that of the wires, from the page's theme. */
+  /** Set the colours of the surface and of the wireframe from the page's theme. */
   theme(plain: string, wire: string): void {
     for (const material of this.materials) (material.uniforms["plain"]!.value as Color).set(plain);
     (this.wire.material.uniforms["plain"]!.value as Color).set(wire);
   }
 
-  /** Take the other side of the faces for the front. */
+  /** Set whether the front and back of the faces are swapped. */
   reverse(reversed: boolean): void {
     for (const material of this.materials) material.uniforms["reversed"]!.value = reversed ? 1 : 0;
   }
@@ -180,7 +180,7 @@ export class Body {
       vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
       side: 2,
-      // The surface is pushed back by a hair, so that wires on it are seen whole.
+      // The surface is drawn slightly further away, so that it does not hide the wireframe.
       polygonOffset: surface,
       polygonOffsetFactor: 1,
       polygonOffsetUnits: 1,
@@ -255,7 +255,7 @@ export class Body {
   }
 }
 
-/** Return true if a frame's camera sees most of the mesh from behind, as the order of its faces' corners has it. */
+/** Return true if a frame's camera sees most of the mesh from behind, according to the winding order of its faces. */
 export function seenFromBehind(preview: Preview, frame: number): boolean {
   const { faces } = preview;
   let area = 0;

@@ -1,11 +1,11 @@
-// Per-point values for colour, and the scale from dark to bright that shows them.
+// Per-point values shown as colours, and their scales from dark to bright.
 
 import { ofSize } from "../words";
 import { type Preview, isHidden, isRejected } from "./preview";
 
 export type Colouring = "film" | "plain" | "expected" | "seen" | "displacement" | "error" | "residual" | "difference";
 
-/** Six colours, evenly spaced, rising in lightness all the way, so that they also read in grey and without red or green. */
+/** Six evenly spaced colours of increasing lightness, readable in greyscale and with red-green colour blindness. */
 export const SCALE = ["#2b2f77", "#28608f", "#1f8f8a", "#58b96d", "#b5d44a", "#fbe94b"];
 /** From blue over light grey to red, for values of both signs. */
 const DIVERGING = ["#2166ac", "#74add1", "#dfe6ea", "#f0e4dd", "#e08a66", "#b2182b"];
@@ -14,24 +14,24 @@ const UNKNOWN = -32767;
 const TOP = 32767;
 
 export interface Values {
-  /** What the colours mean, for the legend. */
+  /** Meaning of the colours, for the legend. */
   words: string;
-  /** What the ends of the scale stand for, with units. */
+  /** Values at the ends of the scale, with units. */
   low: string;
   high: string;
   scale: string[];
-  /** True where some positions have no value and are grey. */
+  /** True if some positions have no value and are grey. */
   hasUnknown: boolean;
-  /** Why they have none; "not seen" unless stated. */
+  /** Why they have none; "hidden" by default. */
   unknown?: string;
-  /** Write frame f's values, 0 … 32767 from one end of the scale to the other, `UNKNOWN` for grey; one a point. */
+  /** Write one value per point of a frame: 0 … 32767 from one end of the scale to the other, `UNKNOWN` for grey. */
   write: (frame: number, into: Int16Array, stride: number, at: number) => void;
 }
 
-/** A value of a point in a frame; NaN where there is none. */
+/** The value of a point in a frame; NaN if there is none. */
 type Value = (frame: number, point: number) => number;
 
-/** Prepare a colouring; null for those without values: plain, and the film's picture. */
+/** Return the values of a colouring; null for those without: plain, and the film's picture. */
 export async function valuesFor(colouring: Colouring, preview: Preview, signal: AbortSignal): Promise<Values | null> {
   if (colouring === "displacement") return displacement(preview);
   if (colouring === "seen") return seen(preview);
@@ -47,14 +47,14 @@ export async function valuesFor(colouring: Colouring, preview: Preview, signal: 
   return null;
 }
 
-/** The colourings that a preview has data for, with people's names. */
+/** Return the colourings that a preview has data for, with their labels. */
 export function colourings(preview: Preview): [Colouring, string][] {
   const all: [Colouring, string, boolean][] = [
     ["film", "film", preview.has("picture") && preview.faces.length > 0],
     ["plain", "plain", true],
     ["expected", "expected error", preview.has("spread")],
     ["error", "3-D error", preview.has("truth")],
-    ["seen", "how often seen", preview.counts(0) !== null],
+    ["seen", "visibility", preview.counts(0) !== null],
     ["residual", "residual", true],
     ["displacement", "displacement", true],
   ];
@@ -67,7 +67,7 @@ export interface Named {
   title: string;
 }
 
-/** The error of one job less that of the other, for two jobs of the same points and frames: 3-D errors where both have them. */
+/** The error of one job minus that of the other, for two jobs with the same points and frames: 3-D errors if both have them. */
 export async function errorDifference(mine: Named, theirs: Named, signal: AbortSignal): Promise<Values | null> {
   const [one, other] = [mine.preview, theirs.preview];
   if (one.points !== other.points || one.frames !== other.frames) return null;
@@ -84,10 +84,10 @@ export async function errorDifference(mine: Named, theirs: Named, signal: AbortS
   const words = `${field === "truth" ? "3-D error" : "Expected error"}, “${mine.title}” minus “${theirs.title}”`;
   const mapped: Value = (frame, point) => 0.5 + value(frame, point) / (2 * most);
   const ends = { low: `−${ofSize(most)}`, high: `+${ofSize(most)}`, scale: DIVERGING };
-  return { words, ...ends, hasUnknown: hides(one) || hides(other), unknown: "not seen in one of the two", write: writer(one, mapped) };
+  return { words, ...ends, hasUnknown: hides(one) || hides(other), unknown: "hidden in one of the two", write: writer(one, mapped) };
 }
 
-/** Standard deviation of each position as a share of the object's size. */
+/** Standard deviation of each position, as a share of the object's size. */
 function deviation(preview: Preview, spread: Uint16Array): Value {
   const unit = (preview.header.spread_step ?? 0) / preview.size;
   return (frame, point) => unit * (spread[preview.points * frame + point] as number);
@@ -107,7 +107,7 @@ function displacement(preview: Preview): Values {
     const offset = (axis: number): number => (positions[at + axis] as number) - (mean[3 * point + axis] as number);
     return unit * Math.hypot(offset(0), offset(1), offset(2));
   };
-  return scaled(preview, value, "Distance from its mean position", ofSize, false);
+  return scaled(preview, value, "Distance from the mean position", ofSize, false);
 }
 
 export function distance(preview: Preview, truth: Int16Array): Value {
@@ -120,7 +120,7 @@ export function distance(preview: Preview, truth: Int16Array): Value {
   };
 }
 
-/** Share of the frames that show a point; grey where none does. */
+/** Share of the frames in which a point is visible; grey if there is none. */
 function seen(preview: Preview): Values {
   const value: Value = (_, point) => {
     const count = preview.counts(point)?.seen ?? 0;
@@ -128,7 +128,7 @@ function seen(preview: Preview): Values {
   };
   const never = Array.from({ length: preview.points }, (_, point) => value(0, point)).some(Number.isNaN);
   const high = `${preview.allFrames} of ${preview.allFrames} frames`;
-  return { words: "Seen in", low: "0", high, scale: SCALE, hasUnknown: never, write: writer(preview, value) };
+  return { words: "Visible in", low: "0", high, scale: SCALE, hasUnknown: never, write: writer(preview, value) };
 }
 
 async function residual(preview: Preview, signal: AbortSignal): Promise<Values> {
@@ -143,15 +143,15 @@ async function residual(preview: Preview, signal: AbortSignal): Promise<Values> 
   const known = ifSeen(preview, residuals, value);
   const counted: Value = (frame, point) => (bits && isRejected(bits, points, frame, point) ? NaN : known(frame, point));
   const figure = new Intl.NumberFormat("en", { maximumSignificantDigits: 3 });
-  return scaled(preview, known, "From track to projection", (top) => `${figure.format(top)} (tracks' unit)`, hides(preview), counted);
+  return scaled(preview, known, "Distance from track to projection", (top) => `${figure.format(top)} (tracks' unit)`, hides(preview), counted);
 }
 
-/** A position that the frame does not show has no value of its own: it follows from its neighbours. */
+/** Positions hidden in a frame have no value: they are inferred from their neighbours. */
 function ifSeen(preview: Preview, residuals: Int16Array, value: Value): Value {
   return (frame, point) => (isHidden(residuals[2 * (preview.points * frame + point)] as number) ? NaN : value(frame, point));
 }
 
-/** The 99th percentile of a sample, so that a few large values do not make everything else dark. */
+/** Return the 99th percentile of a sample, so that a few large values do not darken all others. */
 function quantile(preview: Preview, value: Value): number {
   const sample: number[] = [];
   const frames = Math.max(1, Math.min(preview.frames, preview.ready));
@@ -165,13 +165,13 @@ function quantile(preview: Preview, value: Value): number {
   return sample[Math.floor(0.99 * sample.length)] || Number.MIN_VALUE;
 }
 
-/** `counted` are the values that decide the top of the scale. */
+/** Return values scaled from 0 to the 99th percentile of `counted`. */
 function scaled(preview: Preview, value: Value, words: string, unit: (top: number) => string, hasUnknown: boolean, counted = value): Values {
   const top = quantile(preview, counted);
   return { words, low: "0", high: unit(top), scale: SCALE, hasUnknown, write: writer(preview, (frame, point) => value(frame, point) / top) };
 }
 
-/** True where some frame does not show every point. */
+/** Return true if a point is hidden in some frame, or if this is unknown. */
 function hides(preview: Preview): boolean {
   for (let frame = 0; frame < preview.frames; frame += 1) if (preview.facts(frame).hidden !== 0) return true;
   return false;

@@ -1,4 +1,4 @@
-// Another job's result beside this one: the same moment, the same direction.
+// Another job's result beside this one: at the same frame and from the same side.
 
 import { Body, seenFromBehind } from "./body";
 import { type Picture, pictureOf } from "./picture";
@@ -33,7 +33,7 @@ export class Companion {
     this.body.reverse(seenFromBehind(preview, preview.clearest) !== preview.header.mirrored);
     this.stage.flip(preview.header.mirrored);
     this.stage.add(this.body.group);
-    this.stage.canvas.style.pointerEvents = "none"; // the other view turns both
+    this.stage.canvas.style.pointerEvents = "none"; // the main view rotates both
     this.stage.canvas.setAttribute("role", "img");
     this.stage.canvas.setAttribute("aria-label", "The other job's result, from the same side");
     this.element.append(this.stage.canvas);
@@ -51,7 +51,7 @@ export class Companion {
     this.stage.redraw();
   }
 
-  /** Show the same frame; sequences of different lengths end at their own last one. */
+  /** Show the same frame; a shorter sequence stays at its last one. */
   show(time: number, main: Stage): void {
     this.body.show(Math.min(time, this.preview.frames - 1));
     this.stage.mirror(main);
@@ -64,7 +64,7 @@ export class Companion {
   }
 }
 
-/** Mean error of a job's frames, a share of the object's size: against ground truth, or the expected one; null where unknown. */
+/** RMS over the frames of a job's error or expected error, as a share of the object's size; null if unknown. */
 export function meanError(preview: Preview, name: "error" | "expected"): number | null {
   let sum = 0;
   for (let frame = 0; frame < preview.frames; frame += 1) {

@@ -1,4 +1,4 @@
-// Another job beside this one: its choice, its pane, its curve in the timeline, and the difference of the errors.
+// Comparison with another job: its selection, its pane, its curve in the timeline, and the difference of the errors.
 
 import { h, say } from "../dom";
 import { ofSize } from "../words";
@@ -14,19 +14,19 @@ export interface Compared {
   /** The name of this viewer's job. */
   title: string;
   timeline: Timeline;
-  /** Where the other job's pane is added. */
+  /** The element to which the other job's pane is added. */
   panes: HTMLElement;
   signal: AbortSignal;
-  /** The choice of colours, once it is there. */
+  /** The colour selector, once it exists. */
   colours: () => HTMLSelectElement | null;
   paint: (values: Values) => void;
   repaint: () => void;
-  /** Runs what may fail and shows the failure. */
+  /** Runs an action that may fail and shows the error. */
   guarded: (action: () => Promise<void>) => Promise<void>;
 }
 
 export class Comparison {
-  /** The figures in words. */
+  /** The mean errors of both jobs, as text. */
   readonly summary = h("p", { class: "hint", role: "status" });
   companion: Companion | null = null;
 
@@ -37,13 +37,13 @@ export class Comparison {
     this.own = h("span", { class: "view-name" }, `${parts.title} (this job)`);
   }
 
-  /** The difference of the errors; null where there is no other job, or none of the same points. */
+  /** Return the difference of the errors; null if there is no other job, or if its points differ. */
   async difference(): Promise<Values | null> {
     const { preview, title, signal } = this.parts;
     return this.companion && errorDifference({ preview, title }, { preview: this.companion.preview, title: this.title }, signal);
   }
 
-  /** The choice of a job; the jobs are fetched now, and again when the list is opened. */
+  /** Return the job selector; the jobs are fetched now, and again when it gets the focus. */
   choice(others: () => Promise<Other[]>): HTMLElement {
     let known: Other[] = [];
     const made = choice("Compare with", [["", "no other job"]], (id) => void this.show(known.find((one) => one.id === id) ?? null));
@@ -87,7 +87,7 @@ export class Comparison {
     });
   }
 
-  /** Add the difference of errors to the colours, chosen, or remove it; the first colours follow it where it was shown. */
+  /** Add the difference of errors to the colours and select it, or remove it and return to the first colours. */
   private offerDifference(on: boolean): void {
     const select = this.parts.colours();
     if (select === null) return;

@@ -1,4 +1,4 @@
-// Small controls of the viewer: labelled choices and switches.
+// Small controls of the viewer: labelled selectors and checkboxes.
 
 import { h, uniqueId } from "../dom";
 
@@ -16,7 +16,7 @@ export function toggle(label: string, onChange: (on: boolean) => void, name = ""
   return h("label", { class: "chip" }, box, label);
 }
 
-/** Controls that belong together, with a name for screen readers. */
+/** A group of controls, labelled for screen readers. */
 export function group(label: string, ...controls: (Node | false)[]): HTMLElement {
   return h("div", { class: "tool-group", role: "group", "aria-label": label }, ...controls);
 }

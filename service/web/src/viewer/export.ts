@@ -1,26 +1,26 @@
-// Files made in the browser: a picture of the view, a film of it, and a page of its own with the result in it.
+// Files created in the browser: a picture or a film of the view, and a self-contained page with the result.
 
 import { call, headers } from "../api";
 import { h } from "../dom";
 
-/** Hand bytes to the browser as a download. */
+/** Save content as a download. */
 export function save(content: Blob, name: string): void {
   const url = URL.createObjectURL(content);
   h("a", { href: url, download: name }).click();
   setTimeout(() => URL.revokeObjectURL(url), 60_000);
 }
 
-/** A file name from a job's name. */
+/** Return a file name derived from a job's name. */
 export function fileName(name: string, end: string): string {
   const plain = name.trim().replace(/[^\p{L}\p{N}._-]+/gu, "-").replace(/^-+|-+$/g, "");
   return `${plain || "pliant"}${end}`;
 }
 
-/** Draw canvases side by side over a colour, each as large as it is on the screen. */
+/** Draw canvases side by side on a background colour, each at its own size. */
 export function compose(canvases: HTMLCanvasElement[], background: string, into = document.createElement("canvas")): HTMLCanvasElement {
   const width = canvases.reduce((sum, canvas) => sum + canvas.width, 0);
   const height = Math.max(...canvases.map((canvas) => canvas.height));
-  // Encoders of films need even sides.
+  // Video encoders need even sides.
   const [wide, tall] = [width - (width % 2), height - (height % 2)];
   if (into.width !== wide || into.height !== tall) Object.assign(into, { width: wide, height: tall });
   const context = into.getContext("2d") as CanvasRenderingContext2D;
@@ -47,7 +47,7 @@ const FORMATS: [type: string, end: string][] = [
   ["video/webm", ".webm"],
 ];
 
-/** Return the best format of film that this browser encodes, or null. */
+/** Return the best film format that this browser can encode, or null. */
 export function filmFormat(): { type: string; end: string } | null {
   if (typeof MediaRecorder === "undefined" || !("captureStream" in HTMLCanvasElement.prototype)) return null;
   const found = FORMATS.find(([type]) => MediaRecorder.isTypeSupported(type));
@@ -57,13 +57,13 @@ export function filmFormat(): { type: string; end: string } | null {
 export interface Recording {
   seconds: number;
   fps: number;
-  /** Draw the picture of a share of the way, 0 … 1, and return what to record. */
+  /** Draw the view at a share of the recording, 0 … 1, and return the canvases to record. */
   draw: (share: number) => HTMLCanvasElement[];
   background: string;
   onShare: (share: number) => void;
 }
 
-/** Record a film in real time, as browsers encode it; it ends early when `signal` fires. */
+/** Record a film in real time, as MediaRecorder requires; it ends early when `signal` fires. */
 export async function record(what: Recording, type: string, signal: AbortSignal): Promise<Blob> {
   const canvas = compose(what.draw(0), what.background);
   const stream = canvas.captureStream(what.fps);
@@ -90,7 +90,7 @@ export async function record(what: Recording, type: string, signal: AbortSignal)
   return new Blob(parts, { type });
 }
 
-/** Return a page that shows a result without any service: script, style and files are in it. */
+/** Return a page that shows a result without a service: script, style and files are embedded. */
 export async function standalonePage(title: string, files: { preview: string; film: string | null }): Promise<Blob> {
   const linked = (name: string): string => {
     const address = document.querySelector<HTMLMetaElement>(`meta[name="pliant-standalone-${name}"]`)?.content;
@@ -111,10 +111,10 @@ export async function standalonePage(title: string, files: { preview: string; fi
     '<!doctype html>\n<html lang="en">\n<head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">',
     `<meta name="color-scheme" content="light dark"><title>${escape(title)}</title>\n<style>${style}</style></head>\n`,
     `<body class="standalone"><main><h1>${escape(title)}</h1><div id="stage" class="stage"></div>`,
-    '<p class="hint">Made with Pliant. This file needs no network.</p></main>\n',
+    '<p class="hint">Made with Pliant. This file works offline.</p></main>\n',
     data("preview", preview),
     film === null ? "" : data("film", film),
-    // The string "</script" inside a script would end it.
+    // The string "</script" would end the script.
     `<script>${script.replace(/<\/script/gi, "<\\/script")}</script></body></html>\n`,
   ];
   return new Blob(page, { type: "text/html" });

@@ -1,18 +1,18 @@
-// Reading film_frames.bin, small pictures of every tracked frame of a film (worker/films/frame_strip.py).
+// Reading film_frames.bin, the small pictures of every tracked frame of a film (worker/films/frame_strip.py).
 
 import { call, headers } from "../api";
 
 const MAGIC = "PLIANTFF";
 const PREFIX = 16;
-/** Decoded pictures that are kept. */
+/** Number of decoded pictures to keep. */
 const KEPT = 48;
 
 interface Header {
   version: number;
-  /** Of the film in pixels. */
+  /** Size of the film in pixels. */
   width: number;
   height: number;
-  /** Where each picture begins, and where the last ends, bytes from the file's begin. */
+  /** Start of each picture and end of the last one, in bytes from the start of the file. */
   offsets: number[];
 }
 
@@ -38,12 +38,12 @@ export class FilmFrames {
 
   static async open(url: string, signal: AbortSignal): Promise<FilmFrames> {
     const raw = new Uint8Array(await (await call(url, { headers: headers(), signal })).arrayBuffer());
-    if (new TextDecoder().decode(raw.subarray(0, 8)) !== MAGIC) throw new Error("This is no file of film frames.");
+    if (new TextDecoder().decode(raw.subarray(0, 8)) !== MAGIC) throw new Error("This is not a film frames file.");
     const length = new DataView(raw.buffer).getUint32(12, true);
     return new FilmFrames(raw, JSON.parse(new TextDecoder().decode(raw.subarray(PREFIX, PREFIX + length))) as Header);
   }
 
-  /** Return a frame's picture if it is decoded; if not, decode it and call `onReady`. */
+  /** Return a frame's picture if it is decoded; otherwise return null, decode it and call `onReady`. */
   picture(frame: number, onReady: () => void): ImageBitmap | null {
     const known = this.decoded.get(frame);
     if (known instanceof ImageBitmap) return known;

@@ -1,10 +1,10 @@
-// The film beside the mesh at the same moment, with the tracks and the projected mesh over it; without a film, the tracks alone.
+// The film beside the mesh at the same frame, with the tracks or the projected mesh over it; without a film, the tracks alone.
 
 import { edges } from "./body";
 import type { FilmFrames } from "./filmframes";
 import { type Preview, isHidden } from "./preview";
 
-/** Points drawn at most, over a film and without one: the picture should be seen between them. */
+/** Maximum number of points drawn over a film, so that the picture stays visible, and without one. */
 const MOST = { film: 500, plain: 3000 };
 const TAIL = 6;
 
@@ -44,7 +44,7 @@ export class FilmPane {
     this.draw();
   }
 
-  /** Show a moment, in frames; measurements are not interpolated. */
+  /** Show a time, in frames; tracks are measurements and are not interpolated. */
   show(time: number): void {
     this.time = time;
     this.draw();
@@ -114,7 +114,7 @@ export class FilmPane {
     context.globalAlpha = 1;
   }
 
-  /** Where the tracker saw a point: its projection and the residual; null where it is hidden. */
+  /** Return the tracked position of a point: its projection plus the residual; null if it is hidden. */
   private track(frame: number, point: number): [number, number] | null {
     const { preview, residuals } = this;
     const from = 2 * (preview.points * frame + point);
@@ -124,7 +124,7 @@ export class FilmPane {
     return [x + preview.header.residual_step * u, y + preview.header.residual_step * v];
   }
 
-  /** The part of the picture that the tracks of all frames lie in. */
+  /** Return the bounding box of the tracks of all frames, with a margin. */
   private around(): Frame {
     const { preview } = this;
     const [low, high] = [[Infinity, Infinity], [-Infinity, -Infinity]] as [[number, number], [number, number]];

@@ -3,11 +3,11 @@
 import { button, h, uniqueId } from "../dom";
 
 const KEYS: [string, string][] = [
-  ["Drag, arrow keys", "turn"],
-  ["Wheel or pinch, + and −", "zoom (the wheel after a click on the picture)"],
+  ["Drag, arrow keys", "rotate"],
+  ["Wheel or pinch, + and −", "zoom (for the wheel, click the picture first)"],
   ["Right button or two fingers", "move"],
   ["Click or tap a point, Enter", "show its values (Enter: the point in the middle)"],
-  ["Space", "play and pause"],
+  ["Space", "play or pause"],
   [", and .", "one frame back and forward"],
   ["1, 2, 3", "front, side, top"],
   ["0", "fit the mesh to the picture"],
@@ -16,7 +16,7 @@ const KEYS: [string, string][] = [
   ["?", "this help"],
 ];
 
-/** Show the help; it is removed when it is closed. `holder` is on top where it fills the screen. */
+/** Show the help inside `holder`, so that it is also visible in full screen; it is removed when closed. */
 export function openHelp(holder: HTMLElement): void {
   if (holder.querySelector("dialog.help")) return;
   const title = uniqueId("help");

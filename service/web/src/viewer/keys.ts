@@ -1,13 +1,13 @@
-// The keyboard and the pointer on the picture, and the keys of the time slider.
+// Keyboard and pointer control of the picture, and the keys of the time slider.
 
 import { h } from "../dom";
 import type { Side } from "./stage";
 
 const TURN = Math.PI / 24;
-/** A pointer that moved further than this between down and up, CSS pixels, turned the view and chose no point. */
+/** A pointer that moves further than this between down and up, CSS pixels, rotates the view instead of choosing a point. */
 const STILL = 5;
 
-/** What keys and clicks on the picture do. */
+/** Actions of keys and clicks on the picture. */
 export interface Commands {
   turn(across: number, down: number): void;
   zoom(factor: number): void;
@@ -18,15 +18,15 @@ export interface Commands {
   follow(): void;
   fullScreen(): void;
   help(): void;
-  /** Show the values of the point at this place of the window; null: the middle of the picture. */
+  /** Show the values of the point at this position in the window; null: the middle of the picture. */
   pick(x: number | null, y: number | null): void;
 }
 
-/** Let a canvas take keys and clicks. */
+/** Make a canvas respond to keys and clicks. */
 export function control(canvas: HTMLCanvasElement, commands: Commands): void {
   canvas.tabIndex = 0;
   canvas.setAttribute("role", "application");
-  canvas.setAttribute("aria-label", "3-D view: arrow keys turn it, plus and minus zoom, space plays and pauses, Enter shows a point's values, question mark lists all keys");
+  canvas.setAttribute("aria-label", "3-D view: arrow keys rotate, plus and minus zoom, space plays and pauses, Enter shows a point's values, question mark lists all keys");
   const actions = keys(commands);
   canvas.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
@@ -66,7 +66,7 @@ function keys(commands: Commands): Record<string, () => void> {
   };
 }
 
-/** The slider of the time: dragging moves freely, keys go to whole frames. */
+/** The time slider: dragging moves continuously, keys move by whole frames. */
 export function timeSlider(frames: number, now: () => number, seek: (time: number) => void): HTMLInputElement {
   const slider = h("input", { type: "range", min: 0, max: frames - 1, step: "any", "aria-label": "Frame" });
   slider.addEventListener("input", () => seek(Number(slider.value)));

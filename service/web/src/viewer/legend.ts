@@ -1,9 +1,9 @@
-// The scale of the colours under the picture.
+// The legend of the colours below the picture.
 
 import { fill, h } from "../dom";
 import type { Values } from "./colours";
 
-/** Show the scale of these values, or nothing. */
+/** Show the legend of these values; null hides it. */
 export function showLegend(legend: HTMLElement, values: Values | null): void {
   legend.hidden = values === null;
   fill(legend, JSON.stringify(values), () =>
@@ -13,7 +13,7 @@ export function showLegend(legend: HTMLElement, values: Values | null): void {
           h("span", {}, `${values.words}: ${values.low}`),
           h("span", { class: values.low === "0" ? "ramp" : "ramp diverging" }),
           h("span", {}, values.high),
-          values.hasUnknown && h("span", { class: "key-unknown" }, `grey: ${values.unknown ?? "not seen"}`),
+          values.hasUnknown && h("span", { class: "key-unknown" }, `grey: ${values.unknown ?? "hidden"}`),
         ],
   );
 }

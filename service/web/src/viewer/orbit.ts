@@ -1,7 +1,7 @@
-// Turning, moving and zooming the camera by mouse, finger and key.
+// Rotating, moving and zooming the camera by mouse, touch and keyboard.
 //
-// three.js' OrbitControls keeps a fixed upright, but looking through a frame's own camera may need any roll, and on a phone a
-// finger that moves up or down must scroll the page, not the model. So this keeps an orientation and lets the page scroll.
+// The OrbitControls of three.js have a fixed up direction, but the view through a frame's camera may need any roll, and on a
+// phone a vertical swipe must scroll the page, not rotate the model. This class stores an orientation and lets the page scroll.
 
 import { type OrthographicCamera, Quaternion, Vector3 } from "three";
 
@@ -17,7 +17,7 @@ export class Orbit {
   constructor(
     private readonly camera: OrthographicCamera,
     private readonly canvas: HTMLCanvasElement,
-    /** Called after every change; `byHand` says that a person made it. */
+    /** Called after every change; `byHand` is true if the user made it. */
     private readonly onChange: (byHand: boolean) => void,
   ) {
     canvas.style.touchAction = "pan-y";
@@ -28,7 +28,7 @@ export class Orbit {
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   }
 
-  /** Turn around the upright and around the viewer's horizontal, in radians. */
+  /** Rotate around the vertical axis and around the viewer's horizontal axis, in radians. */
   turn(sideways: number, upwards: number): void {
     const across = new Vector3(1, 0, 0).applyQuaternion(this.orientation);
     this.orientation.premultiply(new Quaternion().setFromAxisAngle(across, upwards));
@@ -41,7 +41,7 @@ export class Orbit {
     this.onChange(true);
   }
 
-  /** Put the camera where the orientation says, `distance` from the target. */
+  /** Place the camera according to the orientation, at `distance` from the target. */
   apply(distance: number): void {
     this.camera.quaternion.copy(this.orientation);
     this.camera.position.set(0, 0, distance).applyQuaternion(this.orientation).add(this.target);
@@ -79,7 +79,7 @@ export class Orbit {
     return a && b ? Math.hypot(a.x - b.x, a.y - b.y) : 0;
   }
 
-  /** The wheel scrolls the page unless the view has been clicked or Ctrl is held (which is what a pinch on a touch pad sends). */
+  /** The wheel scrolls the page unless the view has been clicked or Ctrl is held (as sent by a pinch on a touch pad). */
   private wheel(event: WheelEvent): void {
     if (!event.ctrlKey && document.activeElement !== this.canvas) return;
     event.preventDefault();

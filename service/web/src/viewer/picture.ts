@@ -5,11 +5,11 @@ import type { Preview } from "./preview";
 
 export interface Picture {
   texture: Texture;
-  /** 2 a point, 0 … 1: u right, v down. */
+  /** 2 per point, 0 … 1: u right, v down. */
   places: Float32Array;
 }
 
-/** Fetch and decode the picture that a result was given. */
+/** Fetch and decode the picture of a result. */
 export async function pictureOf(preview: Preview, signal: AbortSignal): Promise<Picture> {
   const [jpeg, places] = await Promise.all([preview.field("picture", signal), preview.field("places", signal)]);
   const texture = new Texture(await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" })));

@@ -1,4 +1,4 @@
-// Time: which moment of the animation is shown, and how it moves on.
+// Playback: the current time of the animation, and how it advances.
 
 import { h } from "../dom";
 import { choice, group } from "./controls";
@@ -6,7 +6,7 @@ import { choice, group } from "./controls";
 export type Ending = "loop" | "back and forth" | "once";
 
 export class Player {
-  /** The moment shown, in frames, 0 … frames − 1; between two frames the picture is mixed. */
+  /** Current time in frames, 0 … frames − 1; between two frames the shape is interpolated. */
   time = 0;
   playing = false;
   speed = 1;
@@ -34,7 +34,7 @@ export class Player {
     this.onStop();
   }
 
-  /** Go to a moment. */
+  /** Go to a time, in frames. */
   seek(time: number): void {
     this.time = Math.min(this.frames - 1, Math.max(0, time));
     this.onTime();
@@ -42,7 +42,7 @@ export class Player {
 
   private readonly tick = (now: number): void => {
     if (!this.playing) return;
-    // A tab in the background gets no pictures; it goes on where it was, not where it would be by now.
+    // A background tab gets no animation frames; playback continues where it stopped, without catching up.
     const passed = Math.min(0.25, (now - this.before) / 1000);
     this.before = now;
     this.time += this.direction * passed * this.fps * this.speed;
@@ -67,12 +67,12 @@ export class Player {
   }
 }
 
-/** The choices of speed and of what follows the last frame. */
+/** The selectors of the speed and of what happens after the last frame. */
 export function paceControls(player: Player): HTMLElement {
   const speeds: [string, string][] = [["1", "1 ×"], ["0.5", "½ ×"], ["0.25", "¼ ×"], ["2", "2 ×"], ["4", "4 ×"]];
   const endings: [string, string][] = [["loop", "loop"], ["back and forth", "back and forth"], ["once", "stop"]];
   return group(
-    "Pace",
+    "Playback",
     h(
       "div",
       { class: "row pace" },

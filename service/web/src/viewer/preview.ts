@@ -1,7 +1,7 @@
 // Reading preview.bin, the compact copy of a result that the worker writes for this page (worker/artifacts/preview.py).
 //
-// Positions are int16 on a uniform grid, frame after frame, so the first frame can be drawn while the last is still on its way;
-// residuals and ground truth are fetched by byte range when they are first asked for.
+// Positions are int16 on a uniform grid, frame after frame, so the first frame can be drawn while later ones are loading;
+// residuals and ground truth are fetched by byte range when first needed.
 
 import { Refusal, call, headers } from "../api";
 
@@ -22,16 +22,16 @@ interface Header {
   fps: number;
   frame_stride: number;
   y_axis: string;
-  /** Ground truth says that the result's depth has the other sign, which the tracks alone cannot tell. */
+  /** True if the ground truth has the opposite sign of depth, which tracks alone do not determine. */
   mirrored: boolean;
   origin: [number, number, number];
   step: number;
   residual_step: number;
-  /** The standard deviation that one step of the section `spread` stands for. */
+  /** Standard deviation of one step of the section `spread`. */
   spread_step?: number;
-  /** Root mean square distance of the points from the centre of their frame: the size that errors are shares of. */
+  /** Root mean square distance of the points from the centre of their frame: the size to which errors are relative. */
   size?: number;
-  /** Frames of the job, of which every `frame_stride`-th is here. */
+  /** Number of frames of the job, of which every `frame_stride`-th is included. */
   all_frames?: number;
   /** Focal length, the tracks' unit; null for orthographic cameras. */
   focal?: number | null;
@@ -53,7 +53,7 @@ interface Header {
   };
 }
 
-/** Arrays that are fetched when they are first needed. */
+/** Arrays that are fetched when first needed. */
 interface Fields {
   residuals: Int16Array;
   truth: Int16Array;
@@ -61,7 +61,7 @@ interface Fields {
   rejected: Uint8Array;
   /** Name of every point. */
   names: string[];
-  /** Where the points are in the picture, 2 a point, 0 … 1: u right, v down. */
+  /** Positions of the points in the picture, 2 per point, 0 … 1: u right, v down. */
   places: Float32Array;
   /** The film's template frame, JPEG. */
   picture: ArrayBuffer;
@@ -78,13 +78,13 @@ const READ: { [Name in Field]: (raw: ArrayBuffer) => Fields[Name] } = {
   picture: (raw) => raw,
 };
 
-/** What is known of one frame; null where it is not. */
+/** Values of one frame; null if unknown. */
 export interface FrameFacts {
-  /** Share of the points that the frame does not show. */
+  /** Share of the points that are hidden. */
   hidden: number | null;
   /** Expected error, a share of the object's size. */
   expected: number | null;
-  /** `e3d_frame`, where ground truth was given. */
+  /** `e3d_frame`, if ground truth was given. */
   error: number | null;
   translation: [number, number];
 }
@@ -92,11 +92,11 @@ export interface FrameFacts {
 const FRAME_COLUMNS = 6;
 
 export class Preview {
-  /** Int16, 3 a point, frame after frame; world = origin + step · value. */
+  /** Int16, 3 per point, frame after frame; world = origin + step · value. */
   readonly positions: Int16Array;
-  /** Frames that have arrived. */
+  /** Number of frames loaded. */
   ready = 0;
-  /** Called when more frames have arrived. */
+  /** Called when more frames have loaded. */
   onFrames: () => void = () => undefined;
   private readonly fields = new Map<Field, Promise<unknown>>();
 
@@ -105,11 +105,11 @@ export class Preview {
     readonly header: Header,
     /** Triangles, 3 indices each. */
     readonly faces: Uint32Array,
-    /** 10 a frame: rotation row by row, camera from world, then the scale. */
+    /** 10 per frame: rotation row by row, camera from world, then the scale. */
     readonly cameras: Float32Array,
-    /** 6 a frame, see worker/artifacts/preview.py; empty in files of older services. */
+    /** 6 per frame, see worker/artifacts/preview.py; empty in files of older services. */
     private readonly frameTable: Float32Array,
-    /** 2 a point: in how many frames it was seen, and in how many of these rejected; empty in files of older services. */
+    /** 2 per point: number of frames in which it is visible, and in which it is rejected; empty in files of older services. */
     private readonly pointTable: Uint32Array,
   ) {
     this.positions = new Int16Array(3 * header.num_points * header.num_frames);
@@ -127,7 +127,7 @@ export class Preview {
     return this.header.sections[field] !== undefined;
   }
 
-  /** Read header, faces and cameras; positions go on arriving after this has returned. */
+  /** Read header, faces and cameras; positions continue to load afterwards. */
   static async open(url: string, signal: AbortSignal): Promise<Preview> {
     const start = await range(url, 0, 4096, signal);
     if (new TextDecoder().decode(start.subarray(0, 8)) !== MAGIC) throw new Error("This is not a preview file.");
@@ -154,7 +154,7 @@ export class Preview {
     return preview;
   }
 
-  /** Fetch a further section once. */
+  /** Fetch another section, once. */
   field<Name extends Field>(name: Name, signal: AbortSignal): Promise<Fields[Name]> {
     const section = this.header.sections[name];
     if (section === undefined) return Promise.reject(new Error(`The preview has no ${name}.`));
@@ -167,17 +167,17 @@ export class Preview {
     return asked;
   }
 
-  /** The object's size, the tracks' unit: what errors are shares of. */
+  /** The object's size in the tracks' unit, to which errors are relative. */
   get size(): number {
     return this.header.size ?? 1;
   }
 
-  /** Frames of the whole job. */
+  /** Number of frames of the job. */
   get allFrames(): number {
     return this.header.all_frames ?? this.frames * this.header.frame_stride;
   }
 
-  /** What is known of a frame. */
+  /** Return the values of a frame. */
   facts(frame: number): FrameFacts {
     const at = (column: number): number | null => {
       const value = this.frameTable[FRAME_COLUMNS * frame + column];
@@ -186,13 +186,13 @@ export class Preview {
     return { hidden: at(2), expected: at(3), error: at(4), translation: [at(0) ?? 0, at(1) ?? 0] };
   }
 
-  /** In how many frames a point was seen, and in how many of these rejected; null in files of older services. */
+  /** Return the number of frames in which a point is visible, and in which it is rejected; null in files of older services. */
   counts(point: number): { seen: number; rejected: number } | null {
     const seen = this.pointTable[2 * point];
     return seen === undefined ? null : { seen, rejected: this.pointTable[2 * point + 1] ?? 0 };
   }
 
-  /** The frame that shows most points. */
+  /** The frame with the most visible points. */
   get clearest(): number {
     let best = 0;
     for (let frame = 1; frame < this.frames; frame += 1) {
@@ -201,7 +201,7 @@ export class Preview {
     return best;
   }
 
-  /** Project a point of the world `(x, y, z)` into a frame's picture, the tracks' unit. */
+  /** Project a world point `(x, y, z)` into a frame's picture, in the tracks' unit. */
   project(frame: number, x: number, y: number, z: number): [number, number] {
     const { rotation: r, scale } = this.camera(frame);
     const [tx, ty] = this.facts(frame).translation;
@@ -213,14 +213,14 @@ export class Preview {
     return [centre[0] + (u - centre[0]) / nearer, centre[1] + (v - centre[1]) / nearer];
   }
 
-  /** A point's place in the world. */
+  /** Return a point's position in the world. */
   place(frame: number, point: number): [number, number, number] {
     const at = 3 * (this.points * frame + point);
     const axis = (k: number): number => (this.header.origin[k] as number) + this.header.step * (this.positions[at + k] as number);
     return [axis(0), axis(1), axis(2)];
   }
 
-  /** Rotation (9 numbers, row by row) and scale of a frame's camera. */
+  /** Return rotation (9 numbers, row by row) and scale of a frame's camera. */
   camera(frame: number): { rotation: Float32Array; scale: number } {
     const at = 10 * frame;
     return { rotation: this.cameras.subarray(at, at + 9), scale: this.cameras[at + 9] as number };

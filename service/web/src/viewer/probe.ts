@@ -1,4 +1,4 @@
-// The values of one point: chosen by click, tap or number, marked in the view, and followed through the frames.
+// The values of one point, chosen by click, tap or number, and marked in every frame of the view.
 
 import { BufferAttribute, BufferGeometry, Points, PointsMaterial } from "three";
 import { button, fill, h, uniqueId } from "../dom";
@@ -20,7 +20,7 @@ export class Probe {
   private truth: Int16Array | null = null;
   private names: string[] | null = null;
 
-  /** `onChange` asks for a new picture. */
+  /** `onChange` is called when the view must be redrawn. */
   constructor(
     private readonly preview: Preview,
     private readonly signal: AbortSignal,
@@ -59,7 +59,7 @@ export class Probe {
     this.onChange();
   }
 
-  /** Bring marker and values to a moment. */
+  /** Update marker and values to a time, in frames. */
   show(time: number): void {
     if (this.point === null) return;
     const { preview, point } = this;
@@ -86,16 +86,16 @@ export class Probe {
     const counts = preview.counts(point);
     if (counts) {
       const rejected = counts.rejected > 0 ? `, ${counts.rejected} rejected as outliers` : "";
-      rows.push(["Seen in", `${counts.seen} of ${count(preview.allFrames, "frame")}${rejected}`]);
+      rows.push(["Visible in", `${counts.seen} of ${count(preview.allFrames, "frame")}${rejected}`]);
     }
-    if (this.residuals) rows.push(["Now", this.now(frame, point)]);
+    if (this.residuals) rows.push(["In this frame", this.now(frame, point)]);
     return rows;
   }
 
   private now(frame: number, point: number): string {
     const hidden = isHidden((this.residuals as Int16Array)[2 * (this.preview.points * frame + point)] as number);
-    if (hidden) return "hidden: drawn from its neighbours and other frames";
-    return this.rejected && isRejected(this.rejected, this.preview.points, frame, point) ? "rejected as an outlier" : "seen";
+    if (hidden) return "hidden: inferred from its neighbours and other frames";
+    return this.rejected && isRejected(this.rejected, this.preview.points, frame, point) ? "rejected as an outlier" : "visible";
   }
 
   private async load(): Promise<void> {
@@ -110,7 +110,7 @@ export class Probe {
         wanted(preview.has("names"), () => preview.field("names", signal)),
       ]);
     } catch {
-      return; // position and count are known without them
+      return; // position and counts are shown without them
     }
     this.frame = -1;
     this.onChange();

@@ -1,13 +1,13 @@
-// The buttons that save what is seen: picture, film, a page of its own, and USDZ.
+// The buttons that save the view: picture, film, self-contained page, and USDZ.
 
 import { quickLookLink } from "../links";
 import { button, h, say } from "../dom";
 import { compose, fileName, filmFormat, png, record, save, standalonePage } from "./export";
 
 const FPS = 30;
-/** A turn around the object takes at least this long, seconds: faster ones cannot be judged. */
+/** Minimum length of a turntable in seconds: in a faster one, the shape is hard to judge. */
 const TURNTABLE_SECONDS = 6;
-/** Recordings are made in real time; longer ones are cut to this, seconds. */
+/** Maximum length of a recording in seconds; recordings are made in real time. */
 const LONGEST = 60;
 
 export interface Saveable {
@@ -15,12 +15,12 @@ export interface Saveable {
   preview: string;
   film: string | undefined;
   usdz: string | undefined;
-  /** Length of the sequence at its own pace. */
+  /** Duration of the sequence at its frame rate. */
   seconds: number;
   background: () => string;
   canvases: () => HTMLCanvasElement[];
   pose: (share: number, kind: "turntable" | "camera") => HTMLCanvasElement[];
-  /** Begin a recording; the function returned ends it. */
+  /** Begin a recording; the returned function ends it. */
   begin: () => () => void;
   signal: AbortSignal;
 }

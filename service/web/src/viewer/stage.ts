@@ -1,30 +1,30 @@
-// The renderer and the camera around the bodies: one view, or two side by side under the same camera.
+// The renderer and its camera: one view, or two side by side with the same camera.
 //
-// The camera is orthographic, like the model that the shapes were solved with. A picture is drawn only when something changed.
+// The camera is orthographic, like the scaled orthographic model of the solver. The view is drawn only when something has changed.
 
 import { Group, Matrix4, type Object3D, OrthographicCamera, Quaternion, Scene, Vector3, Vector4, WebGLRenderer } from "three";
 import { Orbit } from "./orbit";
 import type { Preview } from "./preview";
 
-/** Directions to look from, relative to the camera of the frame that shows most points. */
+/** Viewing directions, relative to the camera of the frame with the most visible points. */
 export type Side = "front" | "side" | "top";
 
-/** The part of a view that the fitted mesh takes. */
+/** Share of a view that the fitted mesh fills. */
 const FILLED = 0.9;
-/** A click this close to a point, in CSS pixels, means the point. */
+/** Maximum distance of a click from the point that it chooses, CSS pixels. */
 const NEAR = 22;
 
 export class Stage {
   readonly canvas: HTMLCanvasElement;
   readonly orbit: Orbit;
-  /** Called before a picture is drawn. */
+  /** Called before each drawing. */
   onDraw: () => void = () => undefined;
-  /** Called when a person takes the camera in hand. */
+  /** Called when the user moves the camera. */
   onTurn: () => void = () => undefined;
   private readonly renderer: WebGLRenderer;
   private readonly camera = new OrthographicCamera();
   private readonly scenes: [Scene, Scene] = [new Scene(), new Scene()];
-  /** Where the data lives: turned by half a turn around x where the data's y runs down, so that up is up on the screen. */
+  /** Parents of the objects: rotated by 180° around x if y points down in the data, so that up is up on the screen. */
   private readonly worlds: [Group, Group] = [new Group(), new Group()];
   private readonly centre = new Vector3();
   private readonly resizing = new ResizeObserver(() => this.resize());
@@ -33,10 +33,10 @@ export class Stage {
   private radius = 1;
   private requested = 0;
   private divided = false;
-  /** True until a person moves the camera: the mesh goes on filling the view when its size changes. */
+  /** True until the user moves the camera: the mesh is fitted again when the size of the view changes. */
   private fitted = true;
 
-  /** Throws when the browser has no WebGL 2. */
+  /** Throws if the browser does not support WebGL 2. */
   constructor(
     private readonly holder: HTMLElement,
     private readonly preview: Preview,
@@ -62,7 +62,7 @@ export class Stage {
     this.resizing.observe(holder);
   }
 
-  /** Put something into the first view, or the second. */
+  /** Add an object to the first or the second view. */
   add(object: Object3D, view: 0 | 1 = 0): void {
     this.worlds[view].add(object);
     this.redraw();
@@ -73,18 +73,18 @@ export class Stage {
     this.redraw();
   }
 
-  /** One view or two. */
+  /** Show one view or two. */
   divide(divided: boolean): void {
     this.divided = divided;
     this.resize();
   }
 
-  /** True where two views stand one above the other. */
+  /** True if two views are stacked vertically. */
   get stacked(): boolean {
     return this.holder.clientWidth < this.holder.clientHeight * 1.1;
   }
 
-  /** Show the other of the two depths that explain the same orthographic tracks. */
+  /** Mirror the depth: orthographic tracks do not determine its sign. */
   flip(flipped: boolean): void {
     if (flipped === this.flipped) return;
     this.flipped = flipped;
@@ -98,7 +98,7 @@ export class Stage {
     return this.flipped;
   }
 
-  /** Look as the camera of the frame that shows most points, or from its right, or from above; the mesh fills the view. */
+  /** Look from the camera of the frame with the most visible points, from its right or from above, and fit the mesh. */
   look(side: Side): void {
     this.through(this.preview.camera(this.preview.clearest).rotation);
     const turned = { front: [0, 0], side: [Math.PI / 2, 0], top: [0, -Math.PI / 2] }[side] as [number, number];
@@ -108,7 +108,7 @@ export class Stage {
     this.fit();
   }
 
-  /** Zoom and move so that the mesh just fills the view in all frames that have arrived. */
+  /** Zoom and move so that the mesh of all loaded frames just fills the view. */
   fit(): void {
     this.fitted = true;
     const inverse = this.orbit.orientation.clone().invert();
@@ -125,19 +125,19 @@ export class Stage {
     this.redraw();
   }
 
-  /** Fit again when more frames have arrived, unless a person has moved the camera. */
+  /** Fit again after more frames have loaded, unless the user has moved the camera. */
   refit(): void {
     if (this.fitted) this.fit();
     else this.redraw();
   }
 
-  /** Stand at a share of one turn around the upright, from the front. */
+  /** Rotate the view by a share of one turn around the vertical axis, starting at the front. */
   turntable(share: number): void {
     const upright = new Quaternion().setFromAxisAngle(new Vector3(0, 1, 0), 2 * Math.PI * share);
     this.orbit.orientation.copy(this.front().multiply(upright));
   }
 
-  /** Return a function that brings the camera back to where it is now. */
+  /** Return a function that restores the current camera. */
   remember(): () => void {
     const [orientation, target, zoom, fitted] = [this.orbit.orientation.clone(), this.orbit.target.clone(), this.camera.zoom, this.fitted];
     return () => {
@@ -149,7 +149,7 @@ export class Stage {
     };
   }
 
-  /** Return the point under a place of the canvas, in CSS pixels from its upper left corner; null if none is near. */
+  /** Return the point at a position in the canvas, in CSS pixels from its upper left corner; null if none is near. */
   pick(x: number, y: number, frame: number): number | null {
     this.draw();
     const view = this.views()[0] as Vector4;
@@ -160,19 +160,19 @@ export class Stage {
       const at = this.onScreen(new Vector3(...this.preview.place(frame, point))).project(this.camera);
       const away = Math.hypot(view.x + ((at.x + 1) / 2) * width - x, top + ((1 - at.y) / 2) * height - y);
       if (away > NEAR) continue;
-      // Of several under the finger the nearest on the picture wins, unless it lies behind the surface.
+      // Of several candidates, the nearest in the picture wins, unless it is behind the surface.
       const score = away / NEAR + (at.z + 1) * 4;
       if (best === null || score < best.away / NEAR + (best.depth + 1) * 4) best = { point, depth: at.z, away };
     }
     return best?.point ?? null;
   }
 
-  /** Draw at once, so that the canvas can be copied in the same task. */
+  /** Draw immediately, so that the canvas can be copied in the same task. */
   drawNow(): void {
     this.draw();
   }
 
-  /** A second stage shows its own scene from the same side: relative to the cameras of one frame. */
+  /** Show the scene from the same side as another stage, relative to the cameras of one frame. */
   mirror(other: Stage): void {
     const frame = Math.min(other.preview.clearest, this.preview.frames - 1);
     const [mine, theirs] = [this, other].map((one) => one.orientationOf(one.preview.camera(frame).rotation)) as [Quaternion, Quaternion];
@@ -182,12 +182,12 @@ export class Stage {
     this.redraw();
   }
 
-  /** Look through a frame's own camera; `rotation` is camera from world, row by row. */
+  /** Look through the camera of a frame; `rotation` is camera from world, row by row. */
   through(rotation: Float32Array): void {
     this.orbit.orientation.copy(this.orientationOf(rotation));
   }
 
-  /** The orientation of the camera of the frame that shows most points. */
+  /** The orientation of the camera of the frame with the most visible points. */
   private front(): Quaternion {
     return this.orientationOf(this.preview.camera(this.preview.clearest).rotation);
   }
@@ -199,13 +199,13 @@ export class Stage {
       if (this.flipped) axis.set(axis.x, axis.y, -axis.z).multiplyScalar(index === 2 ? -1 : 1);
       return this.down ? axis.set(axis.x, -axis.y, -axis.z) : axis;
     };
-    // The camera's rows are right, down and away where y runs down; right, up and towards the viewer where it runs up.
+    // The rows of the camera are right, down and away if y points down; right, up and towards the viewer if it points up.
     const sign = this.down ? -1 : 1;
     const basis = new Matrix4().makeBasis(row(0, 1), row(1, sign), row(2, sign));
     return new Quaternion().setFromRotationMatrix(basis);
   }
 
-  /** Draw soon; many calls before then make one picture. */
+  /** Schedule a drawing; repeated calls are combined. */
   redraw(): void {
     this.requested ||= requestAnimationFrame(() => {
       this.requested = 0;
@@ -221,13 +221,13 @@ export class Stage {
     this.canvas.remove();
   }
 
-  /** From the data's axes to those of the scene. */
+  /** Convert from the data's axes to those of the scene. */
   private onScreen(point: Vector3): Vector3 {
     if (this.flipped) point.z *= -1;
     return this.down ? point.set(point.x, -point.y, -point.z) : point;
   }
 
-  /** Call `use` with points of the frames that have arrived, at most about 100,000. */
+  /** Call `use` with points of the loaded frames, at most about 100,000. */
   private sample(use: (point: Vector3) => void): void {
     const { points, ready } = this.preview;
     const total = points * Math.max(1, ready);
@@ -236,7 +236,7 @@ export class Stage {
     for (let i = 0; i < total; i += stride) use(point.set(...this.preview.place(Math.floor(i / points), i % points)));
   }
 
-  /** Find the middle and the size of all frames that have arrived. */
+  /** Compute the centre and the radius of all loaded frames. */
   private frameOn(): void {
     const [low, high] = [new Vector3(Infinity, Infinity, Infinity), new Vector3(-Infinity, -Infinity, -Infinity)];
     this.sample((point) => {
@@ -247,7 +247,7 @@ export class Stage {
     this.radius = high.distanceTo(low) / 2 || 1;
   }
 
-  /** Give the camera the shape of a view. */
+  /** Set the aspect ratio of the camera to that of a view. */
   private aspect(): void {
     const view = this.views()[0] as Vector4;
     if (view.z === 0 || view.w === 0) return;

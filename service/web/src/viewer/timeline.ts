@@ -1,4 +1,4 @@
-// The chart over the slider: error and hidden share of every frame, on the slider's own axis.
+// The chart above the slider: error and share of hidden points of every frame, aligned with the slider.
 
 import { h, svg, fill } from "../dom";
 import { ofSize, percent } from "../words";
@@ -16,7 +16,7 @@ export class Timeline {
   private readonly name: string;
   private readonly top: number;
 
-  /** `onSeek` gets a frame that was clicked. */
+  /** `onSeek` gets the frame that was clicked. */
   constructor(
     private readonly preview: Preview,
     onSeek: (frame: number) => void,
@@ -37,7 +37,7 @@ export class Timeline {
     this.show(0);
   }
 
-  /** Draw the errors of another job over those of this one. */
+  /** Draw the errors of another job over those of this one; null removes them. */
   compare(other: Preview | null, title = ""): void {
     this.draw(this.top);
     this.element.querySelector(".key-other")?.remove();
@@ -51,7 +51,7 @@ export class Timeline {
     this.needle.before(svg("polyline", { class: "other-error", points: this.line(values, top) }));
   }
 
-  /** Move the needle to a moment, in frames, and write that frame's values. */
+  /** Move the needle to a time, in frames, and show and return the values of that frame. */
   show(time: number): string {
     const frame = Math.min(this.preview.frames - 1, Math.round(time));
     const x = this.x(time);
@@ -70,7 +70,7 @@ export class Timeline {
     return said.join(", ");
   }
 
-  /** Draw everything on a scale whose end is the error `top`. */
+  /** Draw the chart, scaled to the maximum error `top`. */
   private draw(top: number): void {
     this.chart.replaceChildren(...this.areas(top), this.needle);
   }

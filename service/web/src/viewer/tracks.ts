@@ -1,5 +1,5 @@
-// The input tracks over the result: each seen point where the tracker saw it, at the depth of the reconstructed point,
-// with a line to that point. Seen along the camera, the dots are exactly the input.
+// The input tracks over the result: each visible point at its tracked position and at the depth of the reconstructed point,
+// with a line to that point. Viewed through the camera, the dots are exactly the input.
 
 import { BufferAttribute, BufferGeometry, DynamicDrawUsage, Group, LineBasicMaterial, LineSegments, Points, PointsMaterial } from "three";
 import { type Preview, isHidden } from "./preview";

@@ -1,4 +1,4 @@
-// The viewer: the moving result with its controls. This module and three.js arrive as a chunk of their own.
+// The viewer: the animated result with its controls. This module and three.js are loaded as a separate chunk.
 
 import { button, h, say } from "../dom";
 import { Body, seenFromBehind } from "./body";
@@ -20,13 +20,13 @@ import { type Side, Stage } from "./stage";
 import { Timeline } from "./timeline";
 import { TrackDots } from "./tracks";
 
-/** What the viewer shows, and where it finds more. */
+/** The files that the viewer shows, and related jobs. */
 export interface Sources {
   title: string;
   preview: string;
-  /** Small pictures of the film's frames, where the job had a film. */
+  /** Small pictures of the film's frames, if the job has a film. */
   film?: string | undefined;
-  /** USDZ, which phones and headsets show in the room. */
+  /** USDZ, which phones and headsets show in augmented reality. */
   usdz?: string | undefined;
   /** Jobs to compare with. */
   others?: () => Promise<Other[]>;
@@ -53,7 +53,7 @@ export class Viewer {
   private readonly legend = h("div", { class: "legend", hidden: true });
   private readonly play = h("button", { type: "button", class: "play" });
   private readonly clock = h("output", { class: "clock" });
-  private readonly mirrored = h("p", { class: "hint" }, "Depth is mirrored to match the ground truth; files are not.");
+  private readonly mirrored = h("p", { class: "hint" }, "Depth is mirrored to match the ground truth; the files are not.");
   private readonly trouble = h("p", { class: "muted", role: "status" });
   private readonly themes = matchMedia("(prefers-color-scheme: dark)");
 
@@ -61,7 +61,7 @@ export class Viewer {
   static async open(holder: HTMLElement, sources: Sources, signal: AbortSignal): Promise<Viewer> {
     const [preview, film] = await Promise.all([
       Preview.open(sources.preview, signal),
-      // Without its film a result can still be looked at.
+      // A result can be viewed without its film.
       sources.film === undefined ? null : FilmFrames.open(sources.film, signal).catch(() => null),
     ]);
     if (preview.ready === 0) await new Promise<void>((resolve) => (preview.onFrames = resolve));
@@ -141,7 +141,7 @@ export class Viewer {
       this.clock,
     );
     const full = document.fullscreenEnabled ? button("Full screen", () => void this.fullScreen()) : "";
-    // Before the canvas, so that Shift+Tab leads from the player to the picture itself.
+    // Before the canvas, so that Shift+Tab leads from the player directly to the picture.
     const corner = h("div", { class: "corner" }, full, button("Help", () => openHelp(this.holder)));
     const thinned = preview.header.frame_stride > 1 ? `Every ${ordinal(preview.header.frame_stride)} frame is shown; the files contain all frames.` : "";
     const note = h("p", { class: "hint", hidden: !thinned }, thinned);
@@ -245,7 +245,7 @@ export class Viewer {
     this.stage.redraw();
   }
 
-  /** Bring every body to the present moment; called before each picture. */
+  /** Update all objects to the current time; called before each drawing. */
   private place(): void {
     const { time } = this.player;
     this.body.show(time);
@@ -309,7 +309,7 @@ export class Viewer {
     });
   }
 
-  /** Show the film, or the tracks alone, beside the mesh; beside its film a mesh is seen through the same camera. */
+  /** Show the film, or the tracks alone, beside the mesh; beside its film, the mesh is viewed through the same camera. */
   private async beside(on: boolean): Promise<void> {
     if (on && this.film && this.pane === null) this.follow(true);
     await this.guarded(async () => {
@@ -346,14 +346,14 @@ export class Viewer {
     if (box) box.checked = on;
   }
 
-  /** The canvases of all panes at this moment, drawn in this task. */
+  /** The canvases of all panes, drawn in this task. */
   private canvases(): HTMLCanvasElement[] {
     this.stage.drawNow();
     this.comparison.companion?.stage.drawNow();
     return [this.pane?.canvas, this.stage.canvas, this.comparison.companion?.stage.canvas].filter((one) => one !== undefined);
   }
 
-  /** Pose the view for a share of a recorded film: one turn around, or the sequence through its own cameras. */
+  /** Set the view for a share of a recorded film: one turn around the object, or the sequence through its cameras. */
   private pose(share: number, kind: "turntable" | "camera"): HTMLCanvasElement[] {
     const { frames } = this.preview;
     this.player.time = Math.min(frames - 1, share * (frames - 1));
@@ -364,7 +364,7 @@ export class Viewer {
     return this.canvases();
   }
 
-  /** Stop playing for a recording; the function returned restores what was shown. */
+  /** Pause playback for a recording; the returned function restores the view. */
   private hold(): () => void {
     const [following, time] = [this.following, this.player.time];
     const restore = this.stage.remember();
@@ -388,7 +388,7 @@ export class Viewer {
     this.stage.redraw();
   };
 
-  /** Further arrays come over the network: a failure is shown beside the controls and leaves the rest as it was. */
+  /** Run an action that may load arrays; an error is shown below the picture and leaves the rest unchanged. */
   private async guarded(action: () => Promise<void>): Promise<void> {
     try {
       await action();
