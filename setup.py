@@ -1,4 +1,4 @@
-"""Put the built web page into wheel and sdist; everything else is said in pyproject.toml."""
+"""Add the built web page to wheels and sdists; pyproject.toml configures everything else."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from setuptools import setup
 from setuptools.command.build_py import build_py
 from setuptools.command.sdist import sdist
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))  # a build front end runs this file without it
+sys.path.insert(0, str(Path(__file__).resolve().parent))  # build front ends do not add it
 
 from build_page import node_requirement, provide_page
 
 
 class BuildPyWithPage(build_py):
-    """Copies packages into the wheel, the page among them. An editable installation reads the page in place."""
+    """Copies the packages, including the page, into the wheel. Editable installations read the page in place."""
 
     def run(self) -> None:
         """Build the page first, so that its files are found as package data."""
@@ -25,7 +25,7 @@ class BuildPyWithPage(build_py):
 
 
 class SdistWithPage(sdist):
-    """Source archive with the built page, so that installing from it needs no Node.js."""
+    """Builds a source archive that contains the built page, so that installing from it needs no Node.js."""
 
     def run(self) -> None:
         """Build the page first."""

@@ -1,4 +1,4 @@
-"""Which code a number belongs to."""
+"""The commit at which a figure was measured."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ ROOT = Path(__file__).parent.parent
 
 @cache
 def commit() -> str:
-    """Return the short hash of the checked-out commit, with a `+` if files under version control differ from it."""
+    """Return the short hash of the checked-out commit, with a `+` if tracked files of `solver` or `tracking` differ from it."""
     try:
         head = _git("rev-parse", "--short", "HEAD")
         return head + ("+" if _git("status", "--porcelain", "--untracked-files=no", "--", "solver", "tracking") else "")

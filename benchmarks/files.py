@@ -1,10 +1,10 @@
-"""Size of every result file, and the time and memory that writing takes, on the gallery's face as a finished result.
+"""Measure size, writing time and memory of every result file, with the gallery's face as the result.
 
     python -m benchmarks.files                                   99 frames of 29,000 points
     python -m benchmarks.files --sequence DIR/facescan99_rot30      a recorded sequence
     python -m benchmarks.files --frames 300 --points 2000 --options '{"colours": "error", "normals": "animated"}'
 
-Nothing is solved: the truth stands for the result, since no file's size hangs on how good it is, except what is compressed.
+Nothing is solved: the truth stands in for the result, because file sizes do not depend on its accuracy, except those of compressed files.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ def main() -> None:
 
 
 def measured(kind, result: Result, path: Path) -> tuple[int, float, int]:
-    """Bytes, seconds, and the most bytes of Python's and NumPy's memory that were held beside the result.
+    """Return bytes, seconds, and the peak bytes of Python and NumPy memory held besides the result.
 
-    Written twice, since watching the memory takes time.
+    Writes twice, because tracing memory slows writing down.
     """
     began = time.perf_counter()
     with path.open("wb") as file:
@@ -74,7 +74,7 @@ def measured(kind, result: Result, path: Path) -> tuple[int, float, int]:
 
 
 def finished(frames: int, points: int, options: Options) -> Result:
-    """Return the face as the result of a job: the truth, one per mille larger, with residuals as a solve leaves them."""
+    """Return the gallery's face as the result of a job; see `as_result`."""
     made = face(frames, points, degrees=30)
     return as_result(from_gallery(made, "face"), options)
 
@@ -85,7 +85,7 @@ def recorded(folder: Path, options: Options) -> Result:
 
 
 def as_result(case: Case, options: Options) -> Result:
-    """Return the truth of a case as a finished job. Noise of every point by itself would need a mode a frame, which no solve leaves."""
+    """Return a case's truth, scaled by 1.001, as a finished job; independent noise of every point would need a mode per frame."""
     frames, count = case.tracks.visible.shape
     assert case.shapes is not None
     assert case.cameras is not None

@@ -1,14 +1,14 @@
-"""Films end to end: accuracy of tracks and shapes, and what tracking costs.
+"""Measure films end to end: accuracy of tracks and shapes, and the cost of tracking.
 
     python -m benchmarks.films rendered [--only NAME] [--frames N] [--size WxH] [--points N] [--tracks-only] [--out FILE]
     python -m benchmarks.films recorded FOLDER [--tracks-only] [--out FILE]
     python -m benchmarks.films speed [--seconds S] [--size WxH] [--threads N] [--out FILE]
 
-`rendered` renders gallery surfaces with texture, background, blur and noise, tracks them, and solves the tracks found and, for the same
-points, the exact ones. `recorded` takes a folder with `film.mp4`, `mask.png` and `truth.npz` (`frames`, `pixels (K, N, 2)`, `shapes
-(K, N, 3)`). The focal length is never given. `--tracks-only` solves nothing; names of its rows end in "tracks". `speed` tracks a made-up
-film of moving texture in a process of its own and prints seconds and peak memory, for the film and for its first quarter. Results are
-appended as JSON lines; what FILE holds is not measured again.
+`rendered` renders gallery surfaces with texture, background, blur and noise, tracks them, and solves both the estimated and the exact
+tracks of the same points; films already in FILE are skipped. `recorded` takes a folder with `film.mp4`, `mask.png` and `truth.npz`
+(`frames`, `pixels (K, N, 2)`, `shapes (K, N, 3)`). The focal length is never given. `--tracks-only` solves nothing; names of its rows end
+in "tracks". `speed` tracks a synthetic film of moving texture, and its first quarter, each in a separate process, and reports seconds and
+peak memory. Results are appended to FILE as JSON lines.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ SCENES: dict[str, tuple[Callable[[int], Sequence], bool]] = {
 """Surface, and whether a bar passes in front of it."""
 
 DISTANCE = 5.0
-"""Of the camera, in half heights of the object."""
+"""Camera distance, in half heights of the object."""
 
 
 def rendered(given: argparse.Namespace) -> None:
-    """Measure the rendered films that are missing in the file of results."""
+    """Measure the rendered films that the results file lacks."""
     size = _size(given.size)
     for name, (make, occluder) in SCENES.items():
         if given.only and not any(word in name for word in given.only):
@@ -65,7 +65,7 @@ def _label(film: str, given: argparse.Namespace) -> str:
 
 
 def _end_to_end(film: RenderedFilm, points: int) -> dict[str, Any]:
-    """Track a film, and solve at most so many of its points and the exact tracks; 0 solves nothing."""
+    """Track a film; solve at most `points` of its points with estimated and exact tracks, or nothing if 0."""
     start = film.num_frames // 2
     with tempfile.TemporaryDirectory() as folder:
         path = film.write(Path(folder) / "film.mkv")
@@ -95,7 +95,7 @@ def _shapes(film: RenderedFilm, tracked: TrackedFilm, truth: Truth, points: int)
 
 
 def _thinned(tracked: TrackedFilm, points: int, truth: Truth) -> tuple[Mesh, np.ndarray]:
-    """Every n-th row and column of the grid, without points that are not on the object in truth."""
+    """Keep every n-th row and column of the grid, without points that are not on the object."""
     grid, stride = tracked.grid, 1
     while (grid[::stride, ::stride] >= 0).sum() > points:
         stride += 1
@@ -111,7 +111,7 @@ def _solved(tracks: np.ndarray, visible: np.ndarray, mesh: Mesh, size: tuple[int
 
 
 def recorded(given: argparse.Namespace) -> None:
-    """Measure a recorded film against points with known pixels and places."""
+    """Measure a recorded film against points with known pixels and 3-D positions."""
     with np.load(given.folder / "truth.npz") as file:
         frames, pixels, shapes = file["frames"], file["pixels"], file["shapes"]
     began = time.perf_counter()
@@ -140,14 +140,14 @@ def recorded(given: argparse.Namespace) -> None:
 
 
 def _carried(here: np.ndarray, values: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Interpolate values `(K, P, C)` of points that lie `here (P, 2)` at other places `(N, 2)`: `(K, N, C)`."""
+    """Interpolate values `(K, P, C)`, given at positions `here (P, 2)`, at `places (N, 2)`; return `(K, N, C)`."""
     count, _, width = values.shape
     flat = values.transpose(1, 0, 2).reshape(len(here), -1)
     return LinearNDInterpolator(here, flat)(places).reshape(len(places), count, width).transpose(1, 0, 2)
 
 
 def speed(given: argparse.Namespace) -> None:
-    """Track a film and its first quarter, each in a process of its own."""
+    """Track a film and its first quarter, each in a separate process."""
     size, frames = _size(given.size), round(given.seconds * 30)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
@@ -159,7 +159,7 @@ def speed(given: argparse.Namespace) -> None:
 
 
 def write_moving_texture(path: Path, size: tuple[int, int], frames: int) -> None:
-    """Write a film of blurred noise that turns, swells and drifts smoothly: cheap to make at any size."""
+    """Write a film of blurred noise that rotates, scales and shifts smoothly, which is cheap to make at any size."""
     width, height = size
     noise = np.random.default_rng(0).standard_normal((2 * height, 2 * width, 3)).astype(np.float32)
     noise = cv2.GaussianBlur(noise, (0, 0), 2.0)

@@ -1,12 +1,12 @@
-"""The pose of every result file as Blender and trimesh import it, compared point for point with `shapes.npz`.
+"""Compare every result file, as imported by Blender and trimesh, point by point with `shapes.npz`.
 
     python3.11 -m venv build/blender && build/blender/bin/pip install bpy
     python -m benchmarks.imports --blender build/blender/bin/python                              the gallery's face, 99 × 29,000
     python -m benchmarks.imports --blender build/blender/bin/python --sequence DIR/facescan99_rot30
     python -m benchmarks.imports --result FOLDER                                                 a downloaded result; trimesh alone
 
-`FOLDER` holds `shapes.npz`, `shapes.glb`, `shapes_ply.zip`, `shapes_obj.zip` and, optionally, `shapes.usdc`.
-Distances are shares of the bounding box's diagonal.
+`FOLDER` holds `shapes.npz`, `shapes.glb`, `shapes_ply.zip`, `shapes_obj.zip` and, optionally, `shapes.usdc`. Distances are in the tracks'
+unit and as shares of the bounding box's diagonal.
 """
 
 from __future__ import annotations
@@ -99,13 +99,13 @@ def compared(folder: Path, scratch: Path, blender: Path | None) -> list[dict[str
 
 
 def y_axis(folder: Path) -> str:
-    """Return where y of the tracks points: as the report states, down where there is none."""
+    """Return the direction of the tracks' y axis from the report; `down` without a report."""
     report = folder / "report.json"
     return json.loads(report.read_text())["interpretation"]["y_axis"] if report.exists() else "down"
 
 
 def by_trimesh(folder: Path, frames: list[int]) -> dict[str, np.ndarray]:
-    """Return the points `(3, P, 3)` of PLY and OBJ; trimesh plays no animation, so glTF and USD are left to Blender."""
+    """Return the points `(3, P, 3)` of PLY and OBJ; trimesh does not play animations, so only Blender reads glTF and USD."""
     found = {}
     for name in ("ply", "obj"):
         with zipfile.ZipFile(folder / f"shapes_{name}.zip") as archive:

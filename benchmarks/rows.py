@@ -1,4 +1,4 @@
-"""Results files: one JSON object on each line, with the machine and the commit that it was measured on."""
+"""Results files: one JSON object per line, with the machine and the commit of the measurement."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from benchmarks.commit import commit
 
 
 def parser_of(doc: str | None, *, out: Path, points: int | None = None) -> argparse.ArgumentParser:
-    """Return a parser with the options of all measurements that are kept one on a line."""
+    """Return a parser with the options common to all line-by-line measurements."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="directory of recorded sequences")
     parser.add_argument("--only", action="append", default=[], help="names that hold this word")
-    parser.add_argument("--points", type=int, default=points, help="keep at most so many points")
+    parser.add_argument("--points", type=int, default=points, help="keep at most this many points")
     parser.add_argument("--out", type=Path, default=out, help="file to which results are appended")
     return parser
 
@@ -28,7 +28,7 @@ def machine() -> str:
 
 
 def rows(path: Path) -> list[dict[str, Any]]:
-    """Return the measurements there are; a line that an interrupted run cut off is skipped."""
+    """Return the measurements of a file, without truncated lines; an empty list if there is no file."""
     found = []
     for line in path.read_text().splitlines() if path.exists() else []:
         try:
@@ -39,7 +39,7 @@ def rows(path: Path) -> list[dict[str, Any]]:
 
 
 def append_row(path: Path, row: dict[str, Any]) -> None:
-    """Add a measurement on a line of its own, even behind a line that was cut off."""
+    """Append a measurement on a new line, even after a truncated one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a+") as file:
         file.seek(0)

@@ -1,4 +1,4 @@
-"""The sequences that are measured: a directory of recorded ones, or the gallery's."""
+"""Sequences to measure: recorded ones from a directory, or the gallery's."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from benchmarks.subsample import thin_mesh, thin_points
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One sequence, with whatever truth there is."""
+    """One sequence, with the available truth."""
 
     name: str
     tracks: Tracks
@@ -24,9 +24,9 @@ class Case:
     shapes: np.ndarray | None
     """True shapes (F, P, 3), or None."""
     cameras: KnownCamera | None
-    """True cameras, or None; without them the truth is in the axes of each frame's camera, and only metrics per frame hold."""
+    """True cameras, or None; the truth is then in each frame's camera axes, and only per-frame metrics are valid."""
     y_up: bool = False
-    """Recorded sequences may have y up; pictures turn them."""
+    """Whether y points up, as in some recorded sequences; pictures flip it."""
 
 
 GALLERY = {
@@ -38,11 +38,11 @@ GALLERY = {
 
 
 RECONSTRUCTED = ("dinosaur_real",)
-"""Sequences whose shapes are another method's reconstruction: the trajectory basis with K = 12 has them to .00002."""
+"""Sequences whose shapes are another method's reconstruction: the trajectory basis with K = 12 reproduces them to .00002."""
 
 
 def cases(data: Path | None, *, points: int | None, visibility: str, only: list[str]) -> Iterator[Case]:
-    """Go through the sequences whose name holds one of `only` (all of them if it is empty)."""
+    """Yield the sequences whose name contains one of `only`, or all if it is empty."""
     if data is None:
         for name, make in GALLERY.items():
             if wanted(name, only):
@@ -54,7 +54,7 @@ def cases(data: Path | None, *, points: int | None, visibility: str, only: list[
 
 
 def wanted(name: str, only: list[str]) -> bool:
-    """Whether the name holds one of the words; any name does if there are none."""
+    """Return whether the name contains one of the words; True if there are none."""
     return not only or any(word in name for word in only)
 
 
@@ -65,9 +65,9 @@ def from_gallery(sequence: Sequence, name: str) -> Case:
 
 
 def rolled_sheet(frames: int = 12, *, bend: tuple[float, float] = (0.3, 1.3)) -> Case:
-    """Return a sheet of 7 × 6 points rolled onto cylinders before a turning pinhole camera with φ = 600 px and 640 × 480 px.
+    """Return a sheet of 7 × 6 points rolled onto cylinders, turning before a pinhole camera with φ = 600 px and 640 × 480 px.
 
-    Shapes are in camera axes, half-widths of the sheet; `bend` is the curvature of the first and the last cylinder in this unit.
+    Shapes are in camera axes, in half-widths of the sheet; `bend` holds the curvature of the first and of the last cylinder in this unit.
     """
     across, down = (each.ravel() for each in np.meshgrid(np.linspace(-1, 1, 7), np.linspace(-0.7, 0.7, 6)))
     curved, turn = np.linspace(*bend, frames)[:, None], np.linspace(-0.6, 0.6, frames)[:, None]
@@ -82,7 +82,7 @@ def rolled_sheet(frames: int = 12, *, bend: tuple[float, float] = (0.3, 1.3)) ->
 
 
 def read_case(folder: Path) -> Case:
-    """Read `tracks.npz` (tracks, visibility), `mesh.npz` (faces) and `truth.npz` (shapes, rotations), the last two if there.
+    """Read `tracks.npz` (tracks, visibility) and, if present, `mesh.npz` (faces) and `truth.npz` (shapes, rotations).
 
     y points up unless `about.json` names pixels as the unit.
     """
@@ -103,11 +103,11 @@ def read_case(folder: Path) -> Case:
 
 
 def as_given(case: Case, visibility: str) -> Case:
-    """Hide what the file says is hidden ("file"), or take every finite observation as seen ("all")."""
+    """Return a case with visibility from its file ("file"), or with all points visible, projected from the truth where possible ("all")."""
     if visibility == "file" or case.tracks.all_visible:
         return case
     if case.cameras is None or case.shapes is None:
-        return case  # only where the tracks are made from the truth is the position of a hidden point known
+        return case  # without truth, the positions of hidden points are unknown
     rows = case.cameras.rotations[:, :2].transpose(0, 2, 1)
     scales = np.ones(len(rows)) if case.cameras.scales is None else case.cameras.scales
     projected = scales[:, None, None] * (case.shapes @ rows)
@@ -117,7 +117,7 @@ def as_given(case: Case, visibility: str) -> Case:
 
 
 def thin(case: Case, points: int | None) -> Case:
-    """Keep at most so many points, spread evenly, and a mesh between them."""
+    """Keep at most `points` points, spread evenly, and a mesh between them."""
     if points is None or case.tracks.num_points <= points:
         return case
     rest = case.tracks.points[0] if case.shapes is None else case.shapes[0]

@@ -1,4 +1,4 @@
-"""Fewer points of a dense sequence, evenly spread, with a mesh that still follows the surface."""
+"""Thin a dense sequence to evenly spread points, with a mesh that follows the surface."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def thin_points(points: np.ndarray, count: int) -> np.ndarray:
 def thin_mesh(mesh: Mesh, points: np.ndarray, kept: np.ndarray) -> Mesh:
     """Triangulate the kept points along the surface.
 
-    The dual of their geodesic Voronoi diagram: every vertex belongs to the kept vertex that is nearest along the edges,
-    and a triangle whose corners belong to three different ones becomes a triangle between those three.
+    The triangulation is the dual of their geodesic Voronoi diagram: every vertex belongs to the kept vertex nearest along the edges, and a
+    triangle whose corners belong to three different kept vertices becomes a triangle between them.
     """
     edges = mesh.edges
     lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)

@@ -1,16 +1,16 @@
-"""Calibration of the verdict, the expected error and the standard deviations, against ground truth.
+"""Calibration of the verdict, the expected error and the standard deviations against ground truth.
 
     python -m benchmarks.trust [--data DIR] [--only NAME] [--kinds clean,noise] [--points N] [--out FILE]
     python -m benchmarks.trust --tables [--into docs/explanation/trust.md]
 
-Every sequence of the gallery and of DIR is solved clean and spoiled: noise of .02 of the largest coordinate, 10 % gross outliers, 30 %
-hidden in addition, all three, frames shuffled, one frame repeated (a still body); with estimated cameras, and with the true ones where the
-file has them (`given`, `given all`). White noise is added as a sequence without truth. Real photographs in pixels are solved with and
-without `image_size`. Every solve is one line of JSON and is done only once, so that the command can be interrupted and repeated.
+Solves every sequence of the gallery and of DIR clean and spoiled: with noise of .02 of the largest coordinate, 10 % gross outliers, 30 %
+more points hidden, all three, shuffled frames, or one repeated frame (a still body). Cameras are estimated, or the true ones where the file
+has them (`given`, `given all`). White noise serves as a sequence without truth. Photographs in pixels are solved with and without
+`image_size`. Each solve is one JSON line and is done only once, so the command can be interrupted and restarted.
 
-The error is `e3d_frame`, for photographs, whose truth is in millimetres, `e3d_frame_scaled`. `quantiles` are those of |error| over
-standard deviation at 1, 2, … 99 %, so that the coverage of any interval follows from the file. Sequences are split by name
-(`CALIBRATION`): constants of `solver.evaluation.trust` and `solver.shapes.assessment` are chosen on these alone.
+The error is `e3d_frame`, or `e3d_frame_scaled` for photographs, whose truth is in millimetres. `quantiles` holds those of |error| over
+standard deviation at 1, 2, … 99 %, from which the coverage of any interval follows. Sequences are split by name: constants of
+`solver.evaluation.trust` and `solver.shapes.assessment` are chosen on those in `CALIBRATION` only.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CALIBRATION = (
     "aura_anim_rot45", "akhter_dance", "akhter_pickup", "facescan10_rot90", "flag", "ict_beat_9k_rot30", "kinect_paper_dense23",
     "shark_objframe", "sphere", "white_noise_1",
 )  # fmt: skip
-"""Sequences that constants are chosen on: every second one of each kind (faces, mocap, bodies, sheets, gallery)."""
+"""Sequences used to choose constants: every second one of each kind (faces, mocap, bodies, sheets, gallery)."""
 
 SPOILED: dict[str, dict[str, float]] = {
     "clean": {},
@@ -46,15 +46,15 @@ SPOILED: dict[str, dict[str, float]] = {
     "all": {"noise": 0.02, "outliers": 0.1, "hidden": 0.3},
 }
 KINDS = (*SPOILED, "given", "given all", "shuffled", "still")
-"""What is done to a sequence."""
+"""Variants in which a sequence is solved."""
 
 QUANTILES = np.linspace(0.01, 0.99, 99)
 
 IMAGE_SIZES = {"kinect_paper_dense23": (640.0, 480.0)}
-"""Of photographs whose `about.json` does not state it."""
+"""Image sizes, px, of photographs whose `about.json` lacks them."""
 
 Job = tuple[str, str, Case, Settings, bool]
-"""Name, kind, sequence as it is solved, settings, and whether the truth has a unit of its own."""
+"""Name, kind, sequence to solve, settings, and whether the truth has its own unit."""
 
 
 def jobs(data: Path | None, *, points: int, only: list[str], kinds: list[str]) -> Iterator[Job]:
@@ -79,7 +79,7 @@ def jobs(data: Path | None, *, points: int, only: list[str], kinds: list[str]) -
 
 
 def spoiled(case: Case, kind: str) -> Case | None:
-    """Return the sequence as it is solved; None where the kind does not apply."""
+    """Return the sequence to solve; None if the kind does not apply."""
     if kind.startswith("given"):
         corruption = SPOILED["all" if kind == "given all" else "clean"]
         return None if case.cameras is None else replace(case, tracks=corrupt_tracks(case.tracks, **corruption)[0])
@@ -107,7 +107,7 @@ def image_size(data: Path | None, name: str) -> tuple[float, float] | None:
 def measured(case: Case, solution: Solution, *, scale_free: bool) -> dict[str, Any]:
     """Return verdict, expected and true error, and quantiles of the errors over their standard deviations.
 
-    `scale_free` where the truth has a unit of its own.
+    `scale_free`: the truth has its own unit.
     """
     trust = solution.trust
     assert trust is not None
@@ -131,7 +131,7 @@ def measured(case: Case, solution: Solution, *, scale_free: bool) -> dict[str, A
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure what is missing, or print the tables."""
+    """Measure the missing solves, or print the tables."""
     parser = parser_of(__doc__, out=Path("benchmarks/results/trust.jsonl"), points=300)
     parser.add_argument("--kinds", default=",".join(KINDS), help="comma-separated: " + ", ".join(KINDS))
     parser.add_argument("--tables", action="store_true", help="print the tables instead of measuring")

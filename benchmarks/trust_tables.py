@@ -13,7 +13,7 @@ from pliant.solver.evaluation.trust import LOOSE_HELD_OUT, UNTOLD
 from benchmarks.sequences import RECONSTRUCTED
 
 BEGIN, END = "<!-- trust tables -->", "<!-- end of trust tables -->"
-"""Lines of the page between which the tables stand."""
+"""Lines of the page that enclose the tables."""
 
 VERDICTS = {"good": "good", "with_care": "with care", "do_not_use": "do not use"}
 
@@ -21,18 +21,18 @@ CLASSES = ((0.0, 0.03, "below .03"), (0.03, 0.15, ".03 to .15"), (0.15, np.inf, 
 """Bounds of the true error."""
 
 AIM = (0.85, 0.95)
-"""Coverage of the central 90 % intervals that is aimed at."""
+"""Target range for the coverage of the central 90 % intervals."""
 
 Row = dict[str, Any]
 
 
 def written(rows: list[Row], calibration: Sequence[str], page: Path | None) -> None:
-    """Print the tables, or put them into a page between its two marks.
+    """Print the tables, or insert them into a page between its markers.
 
     Raises
     ------
     ValueError
-        The page has no marks.
+        The page lacks a marker.
     """
     text = tables(rows, calibration)
     if page is None:
@@ -60,12 +60,12 @@ def tables(rows: list[Row], calibration: Sequence[str]) -> str:
 
 
 def with_truth(rows: list[Row]) -> list[Row]:
-    """Return the rows without those of sequences whose shapes are a reconstruction."""
+    """Return the rows without sequences whose "true" shapes are a reconstruction."""
     return [row for row in rows if not is_of(row, RECONSTRUCTED)]
 
 
 def is_of(row: Row, names: Sequence[str]) -> bool:
-    """Whether a row belongs to one of these sequences."""
+    """Return whether a row belongs to one of these sequences."""
     return any(row["sequence"].split(" with ")[0] == name for name in names)
 
 
@@ -84,7 +84,7 @@ def confusion(title: str, rows: list[Row]) -> str:
 
 
 def separated(chosen: list[Row], held: list[Row]) -> str:
-    """Return how many solves of each class of true error have the signs of held-out observations and of turn per frame."""
+    """Return a table of how many solves of each class of true error show each of `SIGNS`; empty if no row has them."""
     names = [name for _, _, name in CLASSES]
     lines = [
         "| sign | sequences | " + " | ".join(f"true error {name}" for name in names) + " | white noise |",
@@ -105,19 +105,19 @@ def _by_class(stated: list[tuple[Row, bool]]) -> list[list[tuple[Row, bool]]]:
 
 
 def misses_held_out(row: Row) -> bool | None:
-    """Whether held-out observations are far from their prediction; None where none were held out."""
+    """Return whether held-out observations are far from their prediction; None if none were held out."""
     error = row.get("held_out")
     return None if error is None else error >= LOOSE_HELD_OUT
 
 
 def turn_over_deformation(row: Row) -> float | None:
-    """Return radians of turn per frame over the share of the size by which the shape changes; None for photographs in no order."""
+    """Return the turn per frame, radians, over the deformation per frame relative to the size; None for unordered photographs."""
     turn, change = row.get("degrees_per_frame"), row.get("deformation_per_frame")
     return None if turn is None or change is None else float(np.radians(turn) / max(change, np.finfo(float).tiny))
 
 
 def turns_slowly(row: Row) -> bool | None:
-    """Whether the shape changes by more in a frame than the camera turns; None for photographs in no order."""
+    """Return whether turn over deformation is below `UNTOLD`; None for unordered photographs."""
     found = turn_over_deformation(row)
     return None if found is None else found < UNTOLD
 
@@ -129,7 +129,7 @@ SIGNS = {
 
 
 def missed(rows: list[Row]) -> str:
-    """Return the solves whose verdict breaks a promise: above .15 and good, below .03 and not to be used."""
+    """Return a sentence on solves with a wrong verdict: good with an error above .15, or do not use below .03."""
     wrong = [
         row for row in rows
         if row["true"] is not None
@@ -169,7 +169,7 @@ def pooled(rows: list[Row], width: float = NINETY) -> float:
 
 
 def covered(chosen: list[Row], held: list[Row]) -> str:
-    """Return how many positions and sequences the intervals hold."""
+    """Return a table of the coverage of the intervals, by positions and by solves."""
     lines = [
         "| | solves | positions within the 90 % interval, sequences weighted equally | solves with 85 to 95 % | above | below | "
         "true error within `interval` |",
@@ -194,7 +194,7 @@ def covered(chosen: list[Row], held: list[Row]) -> str:
 
 
 def exceptions(rows: list[Row]) -> str:
-    """Return a sentence that names the solves whose intervals hold less than `AIM` promises, the worst first."""
+    """Return a sentence that names the solves with a coverage below `AIM`, the worst first."""
     shares = [(share, row) for row in rows if (share := within(row)) is not None]
     low = sorted(((share, row) for share, row in shares if share < AIM[0]), key=lambda each: each[0])
     if not low:

@@ -1,11 +1,11 @@
-"""Copy docs/ to a folder, replace each marker ``<!-- generated: NAME -->`` by text from the code, and clean the code fences.
+"""Copy docs/ to a folder, replace each marker ``<!-- generated: NAME -->`` by text generated from the code, and clean code fences.
 
     python docs/generate.py build/docs
 
 Markers: `options` (JSON schema of the job options), `settings` (environment variables), `cli` (the commands' help), `rest`
 (OpenAPI document), `errors` (table of error codes). A fence such as ``bash not-run: REASON`` becomes ``bash``, because Markdown
-renderers other than GitHub's take a longer line for text. Pages, links and anchors are checked by the strict build that follows in
-`make docs`.
+renderers other than GitHub's treat a longer info string as text. The strict build that follows in `make docs` checks pages, links
+and anchors.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ERROR_GROUPS = {
     "Meaning of the input": "The solver raises the same codes as `InvalidInput`.",
     "Command line and start-up": "These end a command or stop the start of a process.",
 }
-"""Sentences below the headings of groups of error codes."""
+"""Introductory sentences of groups of error codes."""
 
 NOTE = re.compile(r"^( *```\w+) not-run: .*$", re.MULTILINE)
 
@@ -58,7 +58,7 @@ def options() -> str:
 
 
 def settings() -> str:
-    """Return a table of the environment variables of the service and one of those of the workers."""
+    """Return a table of the environment variables of the workers, and one of those of the service."""
     from pliant.service import settings as of_service
     from pliant.worker import settings as of_worker
 
@@ -68,11 +68,11 @@ def settings() -> str:
 
 
 def _settings_of(module: ModuleType, record: str) -> list[tuple[str, str, str]]:
-    """Return a row for every setting of a record: variable, default, and meaning with what is expected."""
+    """Return a row for every setting of a record: variable, default, and meaning with the expected values."""
     from pliant.worker.environment import expected_of, fields_of, variable_of
 
     notes, fields = _field_notes(module, record), fields_of(getattr(module, record))
-    for name in fields:  # the page speaks of variables, the class of fields
+    for name in fields:  # the page names variables, the class names fields
         notes = {each: note.replace(f"`{name}`", f"`{variable_of(name)}`") for each, note in notes.items()}
     return [
         (f"`{variable_of(name)}`", _default(field.default), f"{notes[name]} Expected: {expected_of(field)}.")
@@ -106,7 +106,7 @@ def cli() -> str:
 
 
 def rest() -> str:
-    """Return every operation of the OpenAPI document: scope, parameters, answers."""
+    """Return every operation of the OpenAPI document: scope, parameters, responses."""
     document = openapi()
     parts = []
     for path, operations in document["paths"].items():
@@ -198,7 +198,7 @@ def _click_default(parameter: Any) -> str:
 
 
 def _field_notes(module: Any, name: str) -> dict[str, str]:
-    """Return the string behind each field of a class, which Python itself forgets."""
+    """Return the docstring of each field of a class, which Python does not keep."""
     tree = ast.parse(inspect.getsource(module))
     body = next(node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
     notes = {}

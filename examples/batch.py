@@ -15,7 +15,7 @@ with Client() as client:
     jobs = {}
     for path in sorted(folder.glob("*.npz")):
         try:
-            # The same key for the same file: a second run of this script finds the first run's jobs.
+            # The same file has the same key, so a second run of this script finds the jobs of the first run.
             jobs[path.stem] = client.submit(
                 path, name=path.stem, idempotency_key=f"batch/{path.resolve()}/{path.stat().st_mtime_ns}"
             )

@@ -1,8 +1,8 @@
-"""Measure a reconstruction against the truth, and plot the error of every frame.
+"""Compare a reconstruction with the ground truth, and plot the error of every frame.
 
     python examples/evaluate.py TRACKS.npz TRUTH.npz [PLOT.png]
 
-TRUTH.npz holds shapes (F, P, 3). Needs matplotlib.
+TRUTH.npz contains shapes (F, P, 3). Needs matplotlib.
 """
 
 import sys
@@ -18,7 +18,7 @@ with Client() as client:
 for name, value in result.metrics.items():
     print(f"{name:24} {value:.4g}")
 
-# The error of each frame after the best similarity. The service reports its mean as e3d_frame_similarity.
+# The error of each frame after the best similarity transform. The service reports the mean as e3d_frame_similarity.
 true = np.load(truth)["shapes"]
 true = true - true.mean(axis=1, keepdims=True)
 errors = []

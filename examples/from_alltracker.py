@@ -1,10 +1,10 @@
-"""Reconstruct AllTracker's output: a track for every pixel of its picture, of which some thousands inside a mask are taken.
+"""Reconstruct AllTracker's output, which has a track for every pixel: use a few thousand of them inside a mask.
 
     python examples/from_alltracker.py TRACKS.npz MASK.png [OUT.glb]
 
-TRACKS.npz holds AllTracker's own arrays, saved beside the tracker with
-``np.savez("tracks.npz", traj_maps_e=traj_maps_e.cpu(), visconf_maps_e=visconf_maps_e.cpu())``; both are (B, T, 2, H, W), the second holds
-visibility and confidence. MASK.png is white on the subject, drawn on the first frame; it is resized to H × W.
+TRACKS.npz contains AllTracker's arrays, saved in the tracking script with
+``np.savez("tracks.npz", traj_maps_e=traj_maps_e.cpu(), visconf_maps_e=visconf_maps_e.cpu())``. Both are (B, T, 2, H, W); the second has
+visibility and confidence. MASK.png is white on the subject in the first frame; it is resized to H × W.
 """
 
 import sys
@@ -14,7 +14,7 @@ from PIL import Image
 from pliant import Client
 from pliant.client.progress import progress_bar
 
-POINTS = 4000  # a mesh in minutes on two cores; more take longer
+POINTS = 4000  # takes minutes on two cores; more points take longer
 
 source, mask_file = sys.argv[1], sys.argv[2]
 target = sys.argv[3] if len(sys.argv) > 3 else "alltracker.glb"
@@ -22,7 +22,7 @@ arrays = dict(np.load(source))
 maps, certainty = arrays["traj_maps_e"][0], arrays["visconf_maps_e"][0]  # (T, 2, H, W)
 height, width = maps.shape[-2:]
 
-# A regular grid inside the mask keeps its neighbourhood: every n-th row and column, -1 where there is no point.
+# Every n-th row and column inside the mask, so that neighbouring points remain neighbours; -1 where there is no point.
 inside = np.asarray(Image.open(mask_file).convert("L").resize((width, height))) >= 128
 step = max(1, round(np.sqrt(inside.sum() / POINTS)))
 rows, columns = np.arange(0, height, step), np.arange(0, width, step)

@@ -2,7 +2,7 @@
 
     python examples/from_cotracker.py TRACKS.npz [OUT.glb]
 
-TRACKS.npz holds CoTracker's own arrays, saved beside the tracker with
+TRACKS.npz contains CoTracker's arrays, saved in the tracking script with
 ``np.savez("tracks.npz", pred_tracks=pred_tracks.cpu(), pred_visibility=pred_visibility.cpu())``.
 """
 

@@ -1,4 +1,4 @@
-"""Reconstruct a MATLAB file of the literature (W, and S and Rs where known), and save the shapes.
+"""Reconstruct a MATLAB file as used in the literature (W, and optionally S and Rs), and save the shapes.
 
 python examples/from_mat.py FILE.mat [OUT.npz]
 """
@@ -12,7 +12,7 @@ from pliant import Client
 source, target = sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "shapes.npz"
 
 with Client() as client:
-    # The file is sent unchanged. The service finds W and reports how it read the rows; an ambiguous file is an error.
+    # The file is sent unchanged. The service finds W and reports the order of its rows; an ambiguous file is an error.
     result = client.submit(source, mesh="none", name=os.path.basename(source)).wait(timeout=3600)
     print("read as:", result.job.interpretation.layout)
     np.savez_compressed(target, shapes=result.shapes, rotations=result.rotations)

@@ -1,8 +1,8 @@
-"""Reconstruct TAPNext's or TAPIR's output, brought back from the 256 × 256 picture that the model saw to the film's pixels.
+"""Reconstruct the output of TAPNext or TAPIR, converted from the model's 256 × 256 input to the film's pixels.
 
     python examples/from_tapnext.py TRACKS.npz WIDTHxHEIGHT [OUT.glb]
 
-WIDTHxHEIGHT is the film's size. TRACKS.npz holds the model's own arrays, saved beside the tracker. TAPNext, whose tracks are y before x:
+WIDTHxHEIGHT is the film's size. TRACKS.npz contains the model's arrays, saved in the tracking script. TAPNext, with coordinates y, x:
 ``np.savez("tracks.npz", tracks=tracks, visible_logits=visible_logits)`` with shapes (B, T, N, 2) and (B, T, N, 1). TAPIR and BootsTAPIR:
 ``np.savez("tracks.npz", tracks=tracks, occlusion=occlusion, expected_dist=expected_dist)`` with (B, N, T, 2), (B, N, T) and (B, N, T).
 """
@@ -13,7 +13,7 @@ import numpy as np
 from pliant import Client
 from pliant.client.progress import progress_bar
 
-MODEL_SIZE = 256  # sides of the picture that the models are run on; change it if yours was run on another
+MODEL_SIZE = 256  # side of the model's input picture in pixels; change it if yours differs
 
 source, size = sys.argv[1], sys.argv[2]
 target = sys.argv[3] if len(sys.argv) > 3 else "tapnext.glb"
@@ -23,7 +23,7 @@ arrays = dict(np.load(source))
 tracks = np.asarray(arrays["tracks"], dtype=np.float64)
 if "visible_logits" in arrays:  # TAPNext returns y, x
     tracks = tracks[..., ::-1]
-# Stretching the film to a square changed its shape: each axis has a scale of its own. Positions are measured from the picture's corner.
+# The film was stretched to a square, so each axis has its own scale. Positions are measured from the picture's corner.
 arrays["tracks"] = tracks * (width / MODEL_SIZE, height / MODEL_SIZE) - 0.5
 
 with Client() as client, progress_bar() as bar:

@@ -1,4 +1,4 @@
-"""What tests of several folders share: one real service, started once, with its queue and one worker, on a free port."""
+"""Fixtures for several folders: one real service, started once, with its queue and one worker, and an S3 server."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ import typer.testing
 NANIO = shutil.which("nanio", path=f"{sysconfig.get_path('scripts')}:{Path(sys.executable).parent}")
 """A small S3 server."""
 
-# A shell that starts the tests in the background has them ignore Ctrl-C, and every process they start inherits that. The tests
-# press Ctrl-C on purpose.
+# A shell that starts the tests in the background makes them ignore SIGINT, and every process they start inherits that. The tests
+# send SIGINT on purpose.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 # An HTTP client reads the whole bundle of certificate authorities when it opens, which takes as long as a request. No test needs
-# the bundle: one that speaks TLS brings its own certificate.
+# the bundle: tests that use TLS bring their own certificate.
 AUTHORITY = tempfile.NamedTemporaryFile(suffix=".pem")  # noqa: SIM115 - as long as the process
 AUTHORITY.write(
     certifi.contents().partition("-----END CERTIFICATE-----\n")[0].encode() + b"-----END CERTIFICATE-----\n"
@@ -38,7 +38,7 @@ AUTHORITY.write(
 AUTHORITY.flush()
 certifi.where = lambda: AUTHORITY.name
 
-# Typer builds all commands anew for each one that a test invokes.
+# Typer rebuilds all commands whenever a test invokes one.
 typer.testing._get_command = functools.cache(typer.testing._get_command)
 
 
@@ -55,7 +55,7 @@ def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture(scope="session")
 def s3_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A small S3 server of its own, with credentials that it checks."""
+    """URL of a bucket on a small local S3 server that checks its credentials."""
     if NANIO is None:
         pytest.skip("no S3 server here: pip install nanio")
     folder = tmp_path_factory.mktemp("s3")

@@ -66,7 +66,7 @@ SOURCES = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_follow_the_arrows(path: Path) -> None:
+def test_imports_between_folders_are_allowed(path: Path) -> None:
     home = home_of(path)
     for module, at_top in imports_of(path):
         name = module.split(".")
@@ -87,7 +87,7 @@ def test_imports_follow_the_arrows(path: Path) -> None:
 
 @cache
 def run_time_imports(path: Path) -> set[str]:
-    """Return the modules of Pliant that a file imports when it runs; those for type checkers alone do not count."""
+    """Return the Pliant modules that a file imports at run time, without those for type checkers only."""
     tree = ast.parse(path.read_text())
     for node in ast.walk(tree):
         if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
@@ -102,7 +102,7 @@ def run_time_imports(path: Path) -> set[str]:
 
 
 def rooms_below(folder: Path) -> dict[str, set[str]]:
-    """Return for each file and subfolder of a folder which of its siblings it imports."""
+    """Map each file and subfolder of a folder to the siblings that it imports."""
     package = "pliant." + ".".join(folder.relative_to(ROOT).parts)
     rooms: dict[str, set[str]] = {}
     for path in sorted(folder.rglob("*.py")):

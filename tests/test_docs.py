@@ -1,8 +1,8 @@
 """Every code block of README.md and docs/ runs, and every file and test that they name exists.
 
-A block is run in a folder that holds the files the documents speak of (`tracks.npz`, `mesh.obj` …), against a real service that
-stands where they say `http://127.0.0.1:8000`. Blocks of one document run in order and share their names, as a reader's session does.
-A block that cannot run here says so behind its language, with the reason: ``bash not-run: needs Docker``.
+Blocks run in a folder with the files that the documents mention (`tracks.npz`, `mesh.obj` …), against a real service in place of
+`http://127.0.0.1:8000`. Blocks of one document run in order and share their names, like a reader's session. A block that cannot run
+here states the reason after its language: ``bash not-run: needs Docker``.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ SLOW = {
 """Pages whose code solves several jobs, tracks a film or starts an embedded Valkey, left to `make test-slow`."""
 
 LONG = {"docs/how-to/camera.md", "docs/reference/cli.md", "docs/tutorials/blender.md"}
-"""Of these, pages whose shell blocks take most of a minute, left to `make test-long`."""
+"""Slow pages whose shell blocks take most of a minute, left to `make test-long`."""
 
 ADDRESS = "http://127.0.0.1:8000"
 SIZE = re.compile(r"\bface\(\d+, \d+\)")
-"""Gallery sequences in the pages; they are run with a smaller one."""
+"""Gallery sequences in the pages, run at a smaller size."""
 KNOWN_COMMANDS = {"make", "docker", "pip", "git", "cd", "npm", "npx", "uv"}
-"""First words of shell lines that are looked at instead of run: they install, build or need what is not here."""
+"""First words of shell lines that are checked instead of run: they install, build or need what is not available here."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ TESTS = set(re.findall(r"def (test_\w+)\(", "".join(path.read_text() for path in
 
 
 def pages(language: str) -> list[ParameterSet]:
-    """The documents that have something to run, the slow ones marked."""
+    """Return the documents with blocks to run in this language, slow ones marked."""
     named = {path: path.relative_to(ROOT).as_posix() for path in DOCUMENTS}
     ran = [
         path for path in DOCUMENTS if any(b.document == path and b.language == language and not b.note for b in BLOCKS)
@@ -117,7 +117,7 @@ def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
-    """The files that documents speak of; a film only for the tutorial that uses one in a shell."""
+    """The files that the documents mention; a film only for the tutorial that uses one in a shell."""
     if "blender" in request.node.name and request.node.name.startswith("test_shell"):
         for file in request.getfixturevalue("film").iterdir():
             (tmp_path / file.name).symlink_to(file)
@@ -147,11 +147,11 @@ def test_every_code_block_has_a_language(block: Block) -> None:
 
 @pytest.mark.parametrize("document", pages("python"))
 @pytest.mark.slow
-def test_python_runs(document: Path, service_url: str, folder: Path) -> None:
+def test_python_blocks_run(document: Path, service_url: str, folder: Path) -> None:
     blocks = [block for block in BLOCKS if block.document == document and block.language == "python" and not block.note]
     assert blocks
     lines: list[str] = []
-    for block in blocks:  # at its own line, so that a traceback names the document's
+    for block in blocks:  # padded to its own line, so that a traceback shows the document's
         lines += [""] * (block.line - len(lines)) + small(block.text.replace(ADDRESS, service_url)).splitlines()
     runner = "import sys; exec(compile(sys.stdin.read(), sys.argv[1], 'exec'))"
     ran = run([sys.executable, "-W", "error", "-c", runner, document.name], folder, service_url, given="\n".join(lines))
@@ -171,7 +171,7 @@ def test_the_readmes_first_program_is_five_lines() -> None:
 
 @pytest.mark.parametrize("document", pages("bash"))
 @pytest.mark.slow
-def test_shell_runs(document: Path, service_url: str, folder: Path) -> None:
+def test_shell_blocks_run(document: Path, service_url: str, folder: Path) -> None:
     (folder / "examples").symlink_to(ROOT / "examples")
     for block in BLOCKS:
         if block.document != document or block.language != "bash" or block.note:
@@ -191,7 +191,7 @@ def commands_of(block: Block) -> list[str]:
 
 
 def known(command: str, block: Block) -> None:
-    """See that a target of the Makefile exists; other tools are not ours to try here."""
+    """Check that the Makefile has the targets; other tools are not run here."""
     words = shlex.split(command, comments=True)
     if words[0] == "make":
         targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))

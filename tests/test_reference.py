@@ -27,7 +27,7 @@ REFERENCE = ROOT / "docs" / "reference"
 
 @pytest.fixture(scope="module")
 def generate() -> ModuleType:
-    """`docs/generate.py`, which is a script and no package."""
+    """The script `docs/generate.py`, loaded as a module."""
     spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
     assert spec is not None
     assert spec.loader is not None
@@ -49,7 +49,7 @@ def test_every_error_code_is_generated_with_cause_and_remedy(generate: ModuleTyp
         assert f"**Remedy:** {code.remedy}" in text
 
 
-def test_groups_of_error_codes_have_their_sentences(generate: ModuleType) -> None:
+def test_each_group_of_error_codes_has_its_introduction(generate: ModuleType) -> None:
     text = generate.errors()
     assert {
         title for title in generate.ERROR_GROUPS if f"## {title}\n\n{generate.ERROR_GROUPS[title]}" not in text
@@ -57,7 +57,7 @@ def test_groups_of_error_codes_have_their_sentences(generate: ModuleType) -> Non
     assert "### timed_out\n\n**Status 504**, retryable. " in text
 
 
-def test_every_warning_of_the_source_is_documented_and_no_other() -> None:
+def test_exactly_the_warnings_in_the_source_are_documented() -> None:
     assert {normal(text) for text in headings("warnings.md")} == {normal(text) for text in warnings_in_source()}
 
 
@@ -66,7 +66,7 @@ def normal(sentence: str) -> str:
 
 
 def warnings_in_source() -> set[str]:
-    """Sentences in functions whose name speaks of warnings, and of settings without effect; values in them as `…`."""
+    """Return sentences of functions named after warnings and of `without_effect`, with values as `…`."""
     found = set()
     for path in (ROOT / "solver").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -89,7 +89,7 @@ def sentences(node: ast.AST) -> set[str]:
     return {text for child in ast.iter_child_nodes(node) for text in sentences(child)}
 
 
-def test_every_metric_has_its_formula() -> None:
+def test_exactly_the_evaluation_metrics_are_documented() -> None:
     tree = ast.parse(Path(errors_of_shapes.__file__).read_text(encoding="utf-8"))
     evaluate = next(node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == "evaluate")
     names = set()
@@ -116,7 +116,7 @@ def test_every_command_is_generated_with_its_parameters(generate: ModuleType) ->
 
 
 def test_no_help_has_words_in_brackets() -> None:
-    """The terminal takes them for markup and leaves them out."""
+    """The terminal takes them for markup and drops them."""
     import typer
 
     commands, texts = [typer.main.get_command(app)], []
@@ -193,11 +193,11 @@ def test_every_page_is_in_the_navigation() -> None:
     assert sorted(named) == sorted(path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md"))
 
 
-def test_the_readme_names_every_dependency_and_no_other() -> None:
+def test_the_readme_lists_exactly_the_dependencies() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     groups = [project["dependencies"], *project["optional-dependencies"].values()]
     wanted = {re.split(r"[<>=;\[ ]", each)[0].lower() for group in groups for each in group} - {"pliant"}
     table = (ROOT / "README.md").read_text(encoding="utf-8").split("## Dependencies")[1].split("\n## ")[0]
     rows = re.findall(r"^\| ([^|]+) \| ([^|]+) \|", table, re.MULTILINE)
     named = {name.strip().lower() for names, part in rows if part.strip() != "page" for name in names.split(",")}
-    assert named - {"package", "---", "openapi-python-client"} == wanted  # the last has an environment of its own
+    assert named - {"package", "---", "openapi-python-client"} == wanted  # the last has its own environment

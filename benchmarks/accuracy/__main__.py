@@ -3,13 +3,13 @@
     python -m benchmarks.accuracy                          the gallery, clean
     python -m benchmarks.accuracy --data DIR --points 2500  recorded sequences, thinned
     python -m benchmarks.accuracy --data DIR --only face --corruptions all
-    python -m benchmarks.accuracy --data DIR --plan        the whole table, part by part (see plan.py)
+    python -m benchmarks.accuracy --data DIR --plan        the full table, part by part (see plan.py)
     python -m benchmarks.accuracy --tables                  print what has been measured so far
     python -m benchmarks.accuracy --tables --summary FILE   write mean and spread of every cell, in every metric, as JSON lines
     python -m benchmarks.accuracy --gate                    small gallery sequences against the committed baseline
 
-Every finished cell is a line of JSON in `--results`, with the commit that it was measured at; a second run skips what is there, or,
-with `--remeasure`, what is there from the same commit.
+Each finished cell is one JSON line in `--results`, with its commit. A second run skips finished cells; with `--remeasure`, only those of
+the current commit.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from benchmarks.rows import append_row
 from benchmarks.sequences import Case, cases, wanted
 
 SLOW = 10.0
-"""Seconds; three trials instead of five where a run takes longer."""
+"""Run time, s, above which a corruption gets three trials at most."""
 
 VISIBILITIES = ("file", "all")
-"""Visibility as the sequence states it, or every point taken as visible."""
+"""Visibility from the file, or every point treated as visible."""
 
 
 def main() -> int:
-    """Measure what is missing, then print the tables."""
+    """Measure the missing cells, then print the tables."""
     options = _parser().parse_args()
     if options.gate or options.update_baseline:
         return gate.main(update=options.update_baseline)
@@ -56,13 +56,13 @@ def main() -> int:
 
 
 def measure_all(options: argparse.Namespace) -> None:
-    """Measure every missing cell of every sequence that the options name."""
+    """Measure the missing cells of the selected sequences."""
     for case in cases(options.data, points=options.points, visibility=options.visibility, only=list(options.only)):
         measure_case(case, options)
 
 
 def measure_case(case: Case, options: argparse.Namespace) -> None:
-    """Measure every missing cell of one sequence."""
+    """Measure the missing cells of one sequence."""
     seconds: dict[tuple[str, str], float] = {}
     done = read_rows(options.results)
     if options.remeasure:
@@ -88,7 +88,7 @@ def measure_case(case: Case, options: argparse.Namespace) -> None:
 
 
 def keys(case: Case, options: argparse.Namespace) -> Iterator[Key]:
-    """List the cells of one sequence, in the order in which they are measured."""
+    """Yield the cells of one sequence in measuring order."""
     for corruption in CORRUPTIONS:
         if (
             corruption != "clean"
@@ -153,7 +153,7 @@ def _parser() -> argparse.ArgumentParser:
         "--summary", type=Path, help="write mean and spread of every cell and metric to this JSON-lines file"
     )
     parser.add_argument("--gate", action="store_true", help="exit 1 if a small sequence got worse than the baseline")
-    parser.add_argument("--update-baseline", action="store_true", help="write the baseline anew")
+    parser.add_argument("--update-baseline", action="store_true", help="rewrite the baseline")
     return parser
 
 

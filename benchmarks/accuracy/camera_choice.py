@@ -1,11 +1,11 @@
-"""`camera=auto` beside orthography on sequences as they are recorded: it should cost nothing where there is no perspective.
+"""Compare `camera=auto` with orthography on recorded sequences, where it should cost nothing without perspective.
 
     python -m benchmarks.accuracy.camera_choice --data DIR [--only NAME] [--points 300] [--distance 3] [--out FILE]
     python -m benchmarks.accuracy.camera_choice --table
 
-Both camera models solve the same tracks one after the other. Every sequence is a line of JSON in FILE: errors, processor seconds, the
-focal length if one was found, and whether the shapes are the same to the bit. Sequences that are there are skipped. `--distance` projects
-the true shapes by a pinhole so many half-sizes away (`benchmarks.accuracy.distances`), to compare the times where perspective is found.
+Solves the same tracks with both camera models and appends one JSON line per sequence to FILE: errors, processor seconds, the focal length
+if one was found, and whether the shapes are bit-identical. Sequences already in FILE are skipped. `--distance` projects the true shapes
+with a pinhole camera that many half-sizes away (`benchmarks.accuracy.distances`), to compare times where perspective is found.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ RESULTS = Path(__file__).parent.parent / "results" / "camera_choice.jsonl"
 
 
 def measure(case: Case, *, image_size: tuple[float, float] | None = None) -> dict[str, Any]:
-    """Return one row: the sequence solved with both camera models."""
+    """Solve a sequence with both camera models and return the row."""
     found: dict[str, Any] = {"sequence": f"{case.name} P={case.tracks.num_points}"}
     shapes = []
     for name, camera in (("orthographic", "scaled_orthographic"), ("auto", "auto")):
@@ -43,7 +43,7 @@ def measure(case: Case, *, image_size: tuple[float, float] | None = None) -> dic
 
 
 def table(path: Path) -> str:
-    """Return the rows as a table, with the ratios of error and time."""
+    """Return a Markdown table of the errors and of the ratio of the times."""
     lines = ["| sequence | e3d_frame, orthography | e3d_frame, auto | time ratio | camera |", "|---|---|---|---|---|"]
     for row in rows(path):
         errors = [row["e3d_frame_orthographic"], row["e3d_frame_auto"]]
@@ -55,7 +55,7 @@ def table(path: Path) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure what is missing, and print the table."""
+    """Measure the missing sequences and print the table."""
     parser = parser_of(__doc__, out=RESULTS, points=300)
     parser.add_argument("--distance", help="of a pinhole camera, in half-sizes; the tracks as recorded without it")
     parser.add_argument("--table", action="store_true", help="only print what was measured")

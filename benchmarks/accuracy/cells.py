@@ -1,4 +1,4 @@
-"""One measurement is one cell: a line of JSON, appended when it is done, so that a table can be resumed at any time."""
+"""Cells of the accuracy table: each measurement is one JSON line, so that an interrupted table can be resumed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ METHODS: dict[str, dict[str, str]] = {
     "robust+low_rank": {"method": "robust", "prior": "smooth+low_rank"},
     "default": {},
 }
-"""`default`: the settings as they are when nothing is said, whatever prior that is (`chosen` of a cell names it)."""
+"""Settings of each method; `default` changes none, and its cells name the prior in `chosen`."""
 
 CORRUPTIONS: dict[str, dict[str, float]] = {
     "clean": {},
@@ -38,12 +38,12 @@ CORRUPTIONS: dict[str, dict[str, float]] = {
     "hidden 30 %": {"hidden": 0.30},
     "both": {"noise": 0.01, "outliers": 0.05, "hidden": 0.20},
 }
-"""`both`: 5 % outliers, 20 % hidden and noise of r = .01 together."""
+"""Arguments of `corrupt_tracks`; `both` combines 5 % outliers, 20 % hidden and noise of r = .01."""
 
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """What a cell measures."""
+    """Identity of a cell."""
 
     case: str
     points: int
@@ -54,11 +54,11 @@ class Key:
     corruption: str
     trial: int
     settings: str = ""
-    """Settings beyond the method's, as `name=value,…`."""
+    """Additional settings, as `name=value,…`."""
 
 
 def measure(case: Case, key: Key) -> dict[str, Any]:
-    """Corrupt, solve and compare."""
+    """Corrupt and solve one sequence; return the row of its metrics."""
     tracks, _ = corrupt_tracks(case.tracks, **CORRUPTIONS[key.corruption], seed=key.trial)
     settings = replace(Settings(), **METHODS[key.method], **parse_settings(key.settings))  # type: ignore[arg-type]
     cameras = case.cameras if key.cameras == "true" else None
@@ -68,7 +68,7 @@ def measure(case: Case, key: Key) -> dict[str, Any]:
     rotations = None if case.cameras is None else case.cameras.rotations
     metrics = evaluate(solution, tracks, case.shapes, rotations)
     if rotations is None:
-        # The truth is in each frame's own axes: one transform for the sequence cannot fit, and the number says nothing.
+        # Each frame's truth is then in its own camera axes, so metrics with one transform per sequence are meaningless.
         metrics = {name: value for name, value in metrics.items() if name not in ("e3d_sequence", "e3d_mocap")}
     choices = solution.choices
     chosen = {
@@ -100,7 +100,7 @@ def measure(case: Case, key: Key) -> dict[str, Any]:
 
 
 def parse_settings(text: str) -> dict[str, Any]:
-    """Read `name=value,…`; values are Python literals where they can be, words otherwise."""
+    """Parse `name=value,…`; values that are neither JSON nor True, False or None stay strings."""
     values: dict[str, Any] = {}
     for part in filter(None, text.split(",")):
         name, _, value = part.partition("=")
@@ -117,5 +117,5 @@ def key_of(row: dict[str, Any]) -> Key:
 
 
 def read_rows(path: Path) -> dict[Key, dict[str, Any]]:
-    """Read finished cells; a line cut off by an interrupted run is measured again."""
+    """Read finished cells; truncated lines are skipped, so that their cells are measured again."""
     return {key_of(row): row for row in rows(path)}

@@ -1,9 +1,9 @@
-"""One small solve with one constant of the solver multiplied, in a process of its own, for `benchmarks.accuracy.sensitivity`.
+"""Run one small solve with one solver constant multiplied, in a separate process, for `benchmarks.accuracy.sensitivity`.
 
     python -m benchmarks.accuracy.changed_constant CASE [MODULE NAME FACTOR SECONDS]
 
-The number is multiplied in the source while the module is imported, so that everything that is computed from it follows. Nothing of the
-solver may be imported before. After SECONDS of processor time the kernel ends the process.
+The constant is changed in the module's source during import, so values computed from it change too. The solver must not be imported
+earlier. The kernel kills the process after SECONDS of processor time.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 
 
 class ChangedConstant(MetaPathFinder):
-    """Imports one module with one constant multiplied, or all numbers of a tuple; whole numbers stay whole and at least 1."""
+    """Import hook that multiplies one constant of a module, or every number in its value; see `multiplied`."""
 
     def __init__(self, module: str, name: str, factor: float) -> None:
-        """Change `name` of `module`."""
+        """Multiply `name` in `module` by `factor`."""
         self.module, self.name, self.factor = module, name, factor
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return the module's own specification with a loader that changes the source."""
+        """Return the module's spec with a loader that changes its source."""
         if fullname != self.module:
             return None
         for finder in sys.meta_path:
@@ -63,7 +63,7 @@ def changed(tree: ast.Module, name: str, factor: float) -> ast.Module:
     Raises
     ------
     LookupError
-        No number is assigned to `name` at the top of the module.
+        The module assigns no number to `name` at top level.
     """
     for statement in tree.body:
         value = constants_of(statement).get(name)
@@ -77,14 +77,14 @@ def changed(tree: ast.Module, name: str, factor: float) -> ast.Module:
 
 
 def multiplied(value: float, factor: float) -> float:
-    """Return the product; of a whole number a whole one, at least 1 unless the number is 0."""
+    """Return the product; positive integers stay integers of at least 1, other integers are unchanged."""
     if isinstance(value, int):
         return max(1, round(value * factor)) if value > 0 else value
     return value * factor
 
 
 def constants_of(statement: ast.stmt) -> dict[str, ast.expr]:
-    """Return the upper-case names that a statement at the top of a module assigns numbers to, with their expressions."""
+    """Return the upper-case names to which a top-level statement assigns numbers, with the assigned expressions."""
     if isinstance(statement, ast.AnnAssign) and statement.value is not None:
         pairs = [(statement.target, statement.value)]
     elif isinstance(statement, ast.Assign):
@@ -105,7 +105,7 @@ def _is_number(node: ast.AST) -> bool:
 
 
 def made(name: str) -> tuple[Case, dict[str, Any]]:
-    """Return a small sequence by name, and settings; its cameras are those to be given, if any."""
+    """Return a small sequence by name and its settings; `case.cameras` holds the cameras given to the solver, if any."""
     from dataclasses import replace
 
     from pliant.solver import gallery
@@ -131,7 +131,7 @@ def made(name: str) -> tuple[Case, dict[str, Any]]:
 
 
 def main(arguments: list[str]) -> None:
-    """Solve and print error, processor seconds and a digest of the shapes as one line of JSON."""
+    """Solve, and print error, processor seconds and a digest of the shapes as one JSON line."""
     name, *change = arguments
     if change:
         module, constant, factor, seconds = change

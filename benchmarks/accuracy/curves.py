@@ -1,9 +1,9 @@
-"""Error of the default settings against the share of outliers, the share of hidden points, and the noise: five draws of each level.
+"""Error of the default settings against the share of outliers, the share of hidden points, and the noise: five draws per level.
 
     python -m benchmarks.accuracy.curves [--data DIR] [--only NAME] [--points N] [--draws N] [--out FILE]
 
-Every solve is one line of JSON and is done only once, so that the command can be interrupted and repeated. The clean sequence is one draw
-of level 0. `python -m benchmarks.figures.plots` draws the curves.
+Each solve is one JSON line and is done only once, so the command can be interrupted and restarted. The clean sequence counts as one draw at
+level 0. `python -m benchmarks.figures.plots` draws the curves.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ LEVELS = {
     "hidden": (0.1, 0.2, 0.3, 0.45, 0.6),
     "noise": (0.005, 0.01, 0.02, 0.03, 0.05),
 }
-"""Arguments of `corrupt_tracks`: shares, and the noise's standard deviation over the largest coordinate."""
+"""Arguments of `corrupt_tracks`: shares, and the noise's standard deviation relative to the largest coordinate."""
 
 
 def main() -> None:
-    """Measure the draws that are missing."""
+    """Measure the missing draws."""
     parser = parser_of(__doc__, out=Path("benchmarks/results/curves.jsonl"), points=300)
     parser.add_argument("--draws", type=int, default=5)
     given = parser.parse_args()

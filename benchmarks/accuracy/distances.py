@@ -1,12 +1,12 @@
-"""Error against the distance of the camera: sequences with known cameras seen by a pinhole.
+"""Error against camera distance: sequences with known cameras, projected with a pinhole camera.
 
     python -m benchmarks.accuracy.distances --data DIR [--only NAME] [--points N] [--spoil KINDS] [--out FILE]
 
-The true shapes, seen by their cameras, are scaled to a half-size (largest |coordinate| in the camera frame) of 300 px and projected from
-d half-sizes away into a picture of 1280 × 720 px: u = c + x/(1 + z/φ) with φ = 300·d px and c the centre. All points count as seen; the
-solver gets `image_size`, not φ. Distance `inf` is orthography. `--spoil noise,drift,births,outliers,hidden,all` adds the errors of trackers
-(`benchmarks.accuracy.spoiling`), one kind after the other. Every measurement is appended to FILE as one line of JSON
-{method, sequence, metric, value, trial, distance, seconds}, and measured only once.
+The true shapes, in camera axes, are scaled to a half-size (largest |coordinate|) of 300 px and projected from d half-sizes away into a
+picture of 1280 × 720 px: u = c + x/(1 + z/φ) with φ = 300·d px and c the centre. All points are visible; the solver is given `image_size`
+but not φ. Distance `inf` means orthography. `--spoil noise,drift,births,outliers,hidden,all` adds tracker errors
+(`benchmarks.accuracy.spoiling`), one kind at a time. Each metric is appended to FILE as one JSON line {method, sequence, metric, value,
+trial, distance, seconds}; finished measurements are not repeated.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PICTURE = (1280.0, 720.0)
 """Width and height, px."""
 
 DISTANCES = ("3", "5", "10", "inf")
-"""Of the camera, in half-sizes."""
+"""Camera distances in half-sizes."""
 
 CAMERAS = {"auto": "auto", "orthographic": "scaled_orthographic"}
 """Camera model of each method."""
@@ -37,16 +37,16 @@ CAMERAS = {"auto": "auto", "orthographic": "scaled_orthographic"}
 METRICS = (
     "e3d_frame_scaled", "e3d_frame_similarity", "e3d_frame", "rotation_degrees", "focal_error", "reprojection_rms",
 )  # fmt: skip
-"""Metrics that are kept; `mirrored` is 1 where the shapes came out with the wrong sign of depth."""
+"""Stored metrics, besides `mirrored` (1 where the depth sign is wrong) and `settled` (1 where the solver settled it)."""
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 """From camera axes with y up and z towards the camera to axes with y down and z away from it."""
 
 
 def seen_from(case: Case, distance: float) -> tuple[Tracks, np.ndarray, np.ndarray]:
-    """Return tracks in pixels, true shapes (F, P, 3) in pixels, and true rotations (F, 3, 3), y down, of a case that has both.
+    """Return tracks in pixels, true shapes (F, P, 3) in pixels, and true rotations (F, 3, 3), y down.
 
-    The distance is in half-sizes; infinite for orthography.
+    `distance` is in half-sizes, infinite for orthography. Raises ValueError if the case has no true shapes or cameras.
     """
     if case.shapes is None or case.cameras is None:
         raise ValueError(f"{case.name} has no true shapes and cameras")
@@ -60,7 +60,7 @@ def seen_from(case: Case, distance: float) -> tuple[Tracks, np.ndarray, np.ndarr
 
 
 def mirrored(shapes: np.ndarray, truth: np.ndarray) -> bool:
-    """Whether mirrored shapes fit the truth better than the shapes do, a rotation free in every frame."""
+    """Return whether the mirrored shapes fit the truth better, with a free rotation per frame."""
     products = np.einsum("fpi,fpj->fij", truth - truth.mean(axis=1, keepdims=True), shapes)
     values = np.linalg.svd(products, compute_uv=False)
     sign = np.sign(np.linalg.det(products))
@@ -68,7 +68,7 @@ def mirrored(shapes: np.ndarray, truth: np.ndarray) -> bool:
 
 
 def measure(case: Case, distance: str, method: str, *, spoil: str = "clean") -> dict[str, float]:
-    """Solve and compare; `spoil` names one of `SPOILINGS`."""
+    """Solve one case and return its metrics; `spoil` names one of `SPOILINGS`."""
     tracks, shapes, rotations = seen_from(case, float(distance))
     tracks = spoiled(tracks, SPOILINGS[spoil])
     began = time.perf_counter()
@@ -83,7 +83,7 @@ def measure(case: Case, distance: str, method: str, *, spoil: str = "clean") -> 
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure what is missing, and print the table."""
+    """Measure what is missing and print the table."""
     parser = parser_of(__doc__, out=Path("benchmarks/results/distances.jsonl"))
     parser.add_argument("--distances", default=",".join(DISTANCES), help="half-sizes, comma-separated")
     parser.add_argument("--methods", default=",".join(CAMERAS), help="comma-separated: " + ", ".join(CAMERAS))

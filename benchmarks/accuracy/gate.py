@@ -1,4 +1,4 @@
-"""Accuracy on small gallery sequences against a committed baseline: numbers that do not depend on the machine."""
+"""Compare accuracy on small gallery sequences with a committed baseline; the figures do not depend on the machine."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from benchmarks.sequences import from_gallery
 
 BASELINE = Path(__file__).parent / "baseline.json"
 RELATIVE, ABSOLUTE = 0.05, 0.001
-"""A metric may exceed its baseline by 5 % and .001 together; beyond that it is a regression."""
+"""A metric above 1.05 times its baseline plus .001 is a regression."""
 METRICS = ("e3d_frame", "e3d_sequence")
 
 SMALL = {
@@ -24,7 +24,7 @@ SMALL = {
 
 
 def main(*, update: bool) -> int:
-    """Measure; write the baseline or compare with it. Returns 1 if something got worse."""
+    """Write the baseline or compare with it; return 1 if a metric got worse or is missing."""
     measured = measure_all()
     if update:
         BASELINE.write_text(json.dumps({"commit": commit(), "numbers": measured}, indent=1, sort_keys=True) + "\n")
@@ -45,7 +45,7 @@ def main(*, update: bool) -> int:
 
 
 def measure_all() -> dict[str, float]:
-    """Every small sequence × cameras × method, clean, and the robust ones with outliers, noise and hidden points."""
+    """Measure every small sequence, camera source and method; `robust` and `default` also with corruption `both`."""
     numbers = {}
     for name, make in SMALL.items():
         case = from_gallery(make(), name)
@@ -61,7 +61,7 @@ def measure_all() -> dict[str, float]:
 
 
 def regressions(measured: dict[str, float], baseline: dict[str, float]) -> set[str]:
-    """Names of the numbers that exceed the baseline by more than the tolerance."""
+    """Return the names of the metrics that exceed their baseline by more than the tolerance."""
     return {
         name
         for name, value in measured.items()

@@ -1,11 +1,12 @@
-"""Calls of other authors' Octave functions: tracks into a file, one generated script, shapes out of a file.
+"""Call other authors' Octave functions: write the tracks to a file, run a generated script, read the shapes back.
 
-Nothing of theirs is in this project. `FMINUNC` and `CORRECTIVE` are this project's own text, put before Octave's and theirs on the path:
+This project contains none of their code. `FMINUNC` and `CORRECTIVE` are its own and precede Octave's and the authors' functions on the
+path:
 
-- Octave's `fminunc` takes neither a matrix to start from nor further arguments of the objective. MATLAB's takes both.
-- BMM states its convex programme with YALMIP, which takes minutes to build it in Octave. `CORRECTIVE` gives the same programme to the same
-  solver, SDPT3: the nuclear norm of a symmetric matrix Q = X₁ − X₂ is the least sum of the traces of two positive semidefinite ones. With
-  K = 5, both end at .5461 for the face landmarks.
+- Octave's `fminunc` accepts neither a matrix as starting point nor extra arguments for the objective; MATLAB's accepts both.
+- BMM formulates its convex program in YALMIP, which takes minutes to build it in Octave. `CORRECTIVE` passes the same program directly
+  to the same solver, SDPT3: the nuclear norm of a symmetric matrix Q = X₁ − X₂ is the minimum of tr X₁ + tr X₂ over positive
+  semidefinite X₁ and X₂. With K = 5 on the face landmarks, both reach .5461.
 """
 
 from __future__ import annotations
@@ -59,19 +60,18 @@ save ("-v7", "shapes.mat", "S", "seconds");
 
 
 class Failed(Exception):
-    """A method gave no shapes; the text says why."""
+    """A method returned no shapes; the message gives the reason."""
 
 
 def run(call: str, tracks: np.ndarray, *, paths: list[Path], seconds: int) -> tuple[np.ndarray, float]:
-    """Evaluate Octave statements that make `S (3F, P)` of `W (2F, P)`; return shapes `(F, P, 3)` and the processor seconds of the call.
+    """Evaluate Octave statements that compute `S (3F, P)` from `W (2F, P)`; return shapes `(F, P, 3)` and processor seconds.
 
-    The tracks `(F, P, 2)` are complete. Octave searches the last of the folders first, and is ended after so many processor
-    seconds.
+    The tracks `(F, P, 2)` must be complete. Octave searches the last of `paths` first and is killed after `seconds` of processor time.
 
     Raises
     ------
     Failed
-        Octave ended without shapes or took too long, or the shapes are not finite.
+        Octave ended without shapes or exceeded the time, or the shapes are not finite and real.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -85,7 +85,7 @@ def run(call: str, tracks: np.ndarray, *, paths: list[Path], seconds: int) -> tu
         limited = f"ulimit -t {seconds}; exec octave-cli --quiet call.m"
         ended = subprocess.run(["sh", "-c", limited], cwd=folder, capture_output=True, text=True, check=False)
         if not (folder / "shapes.mat").exists():
-            if ended.returncode < 0 and _spent() - before >= 0.8 * seconds:  # a signal, and not for want of memory
+            if ended.returncode < 0 and _spent() - before >= 0.8 * seconds:  # killed for its time, not for its memory
                 raise Failed(f"more than {seconds} s")
             lines = [line for line in ended.stderr.splitlines() if line.startswith("error: ")]
             raise Failed(lines[0].removeprefix("error: ") if lines else f"octave-cli ended with {ended.returncode}")

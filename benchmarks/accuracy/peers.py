@@ -1,4 +1,4 @@
-"""Other authors' methods beside Pliant, on the same complete tracks and with the same metrics.
+"""Compare other authors' methods with Pliant on the same complete tracks, with the same metrics.
 
     python -m benchmarks.accuracy.peers --data DIR --code FOLDER [--only NAME] [--methods pta,bmm,pnd2] [--points 300] [--ours]
     python -m benchmarks.accuracy.peers --table
@@ -6,18 +6,18 @@
 FOLDER holds checkouts of the authors' code, which this project does not contain. Octave runs it, with its package `signal`:
 
 - `pta`: trajectory basis (Akhter, Sheikh, Khan and Kanade, 2008), `nrsfm_trajectory.m` of github.com/umutekingezer/ComputerVision, a
-  course's exercise on the authors' functions; it states no licence
+  course exercise that uses the authors' functions; no licence stated
 - `bmm`: block matrix method (Dai, Li and He, 2012), `NRSFM_BMM.m` of github.com/jvlmdr/low-rank-nrsfm, with github.com/sqlp/sdpt3,
   installed; GPL 3 or later, its read-me says research only. SDPT3: GPL 2
 - `pnd2`: EM-PND2, the Procrustean normal distribution (Lee, Cho, Choi and Oh, 2013; Lee, Cho and Oh, 2016), `NRSfM_PND2.m` of
   github.com/summmanpan/NRSfM_Consensus; GPL 3 or later, its read-me says research only
 
-`pta` and `bmm` need a number of bases K. `AUTHORS` has the authors' own for `bmm`, which they found with the truth. Everywhere else every K
-of a list is run, and the table has the one of least error, which only the truth tells: this favours the peers. Pliant gets default
-settings, the same tracks and no mesh. Sequences without truth or with hidden points are left out.
+`pta` and `bmm` need the number of bases K. `AUTHORS` holds the authors' choices for `bmm`, which they found with the truth. Elsewhere every
+K of a list is run, and the table shows the one with the least error; choosing it needs the truth, which favours the peers. Pliant runs with
+default settings on the same tracks, without a mesh. Sequences without truth or with hidden points are skipped.
 
-Tracks are divided by the mean standard deviation of their rows; the authors of `bmm` divide by the truth's. In `e3d_frame` one mirror for
-the sequence is free, in `e3d_frame_similarity` one for every frame. Seconds are of the processor, one thread.
+Tracks are divided by the mean standard deviation of their rows; the authors of `bmm` divide by that of the truth. `e3d_frame` allows one
+reflection per sequence, `e3d_frame_similarity` one per frame. Seconds are processor time of one thread.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ OURS = "default"
 SECONDS = 300
 
 BASES = {"pta": (2, 3, 5, 9, 12, 13), "bmm": (3, 5, 7)}
-"""Numbers of bases that are run; 12 and 13 are those stated for `pta` on `akhter_pickup` and `akhter_drink`."""
+"""Numbers of bases to try; 12 and 13 are the ones given for `pta` on `akhter_pickup` and `akhter_drink`."""
 
 AUTHORS = {
     "bmm": {"akhter_drink": 12, "akhter_pickup": 12, "akhter_dance": 10, "torresani_walking": 8, "shark_objframe": 4}
 }
-"""The authors' own, in their `NRSFM_example.m`."""
+"""The authors' numbers of bases, from their `NRSFM_example.m`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,10 +57,10 @@ class Peer:
     """How to call a method."""
 
     call: str
-    """Makes `S (3F, P)` of `W (2F, P)`; `{K}` is the number of bases."""
+    """Octave statements that compute `S (3F, P)` from `W (2F, P)`; `{K}` is the number of bases."""
 
     files: tuple[str, ...]
-    """Files whose folders must be on the path, with the folders below."""
+    """Files whose folders, with all subfolders, must be on the path."""
 
 
 PEERS = {
@@ -76,7 +76,7 @@ PEERS = {
 
 
 def bases(method: str, case: Case) -> tuple[int | None, ...]:
-    """Return the numbers of bases to run: as many as the factorization into rank 3K permits."""
+    """Return the numbers of bases to run, up to what a factorization of rank 3K permits."""
     if method not in BASES:
         return (None,)
     stated = AUTHORS.get(method, {}).get(case.name)
@@ -85,12 +85,12 @@ def bases(method: str, case: Case) -> tuple[int | None, ...]:
 
 
 def paths(peer: Peer, code: Path) -> list[Path]:
-    """Return the folders that the method needs.
+    """Return the folders that a method needs on the path.
 
     Raises
     ------
     SystemExit
-        A file is not in any checkout.
+        No checkout contains one of the files.
     """
     found = []
     for name in peer.files:
@@ -103,7 +103,7 @@ def paths(peer: Peer, code: Path) -> list[Path]:
 
 
 def measured(method: str, case: Case, *, K: int | None, code: Path, seconds: int) -> Iterator[dict[str, Any]]:
-    """Run a method once; one row for every metric, or one that says why there is none."""
+    """Run a method once; yield a row per metric, or one row with the reason for its failure."""
     row = {
         "method": method, "sequence": case.name, "frames": case.tracks.num_frames, "points": case.tracks.num_points, "K": K
     }  # fmt: skip
@@ -126,7 +126,7 @@ def measured(method: str, case: Case, *, K: int | None, code: Path, seconds: int
 
 
 def complete(data: Path, *, points: int | None, only: list[str]) -> Iterator[Case]:
-    """Go through the sequences with truth whose points are all seen or may be taken as seen."""
+    """Yield the sequences with truth whose points are all visible or can be treated as visible."""
     for case in cases(data, points=points, visibility="all", only=only):
         if case.shapes is not None and case.tracks.all_visible:
             yield case
@@ -135,7 +135,7 @@ def complete(data: Path, *, points: int | None, only: list[str]) -> Iterator[Cas
 
 
 def table(path: Path, metric: str = "e3d_frame") -> str:
-    """Return the errors, sequences down, with K and seconds in brackets; a method that failed with every K has its reason."""
+    """Return a Markdown table of errors, with K and seconds in brackets; a method that failed with every K shows the reason."""
     found: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for row in rows(path):
         if row["metric"] in (metric, "failed"):
@@ -158,7 +158,7 @@ def _cell(measurements: list[dict[str, Any]]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure what is missing, and print the table."""
+    """Measure what is missing and print the table."""
     parser = parser_of(__doc__, out=RESULTS, points=300)
     parser.add_argument("--code", type=Path, help="folder with the checkouts")
     parser.add_argument("--methods", default=",".join(PEERS), help="comma-separated: " + ", ".join(PEERS))

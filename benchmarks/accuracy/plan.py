@@ -1,8 +1,8 @@
-"""The whole accuracy table as parts, small enough for one machine in one sitting.
+"""Parts of the full accuracy table, small enough to measure on one machine in one session.
 
-The default settings, on clean tracks and against the headline's outliers, keep every point. The comparison of the methods and the trials
-of the corruption table, hundreds of solves, are thinned: which method wins, and what noise, outliers and hidden points do to it, is settled
-long before the points run out, and the table says how many there were.
+The default settings keep every point, on clean tracks and with 10 % outliers. The method comparison and the corruption trials, hundreds of
+solves, use thinned sequences: the ranking of the methods and the effect of corruptions settle at far fewer points. The table lists the
+number used.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ CORRUPTED = ("facescan10_rot90", "facescan99_rot30", "aura_anim_rot45", "akhter_
 FACES = ("facescan10_rot90", "facescan99_rot30", "ict_beat_9k_rot30", "aura_anim_rot45")
 THINNED = 1_000
 SEEN = 700
-"""Points of the table that takes every point as seen, as those who published figures on these sequences do."""
+"""Points in the table that treats every point as visible, as published figures on these sequences do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
-    """Some cells of the table."""
+    """A set of cells of the table."""
 
     only: tuple[str, ...] = ()
     points: int | None = None
@@ -38,4 +38,4 @@ PARTS = (
     Part(only=FACES, corruptions=("outliers 10",), cameras=("estimated",), methods=("default",), trials=1),
     Part(only=CORRUPTED, points=THINNED, corruptions=("all",)),
 )
-"""In the order of what is wanted first; a later part skips what an earlier one has measured."""
+"""By decreasing priority; a part skips cells that an earlier one has measured."""

@@ -1,11 +1,11 @@
-"""How much the constants of the solver matter: small solves with each of them doubled and halved, one at a time.
+"""Sensitivity of the solver to its constants: small solves with each of them doubled and halved, one at a time.
 
     python -m benchmarks.accuracy.sensitivity [--only WORD] [--workers N] [--out FILE]
     python -m benchmarks.accuracy.sensitivity --table
 
-Constants are the numbers that the modules in `ROOMS` assign to upper-case names, at the top. Each solve is a line of JSON and is done only
-once. A change of a constant that the solve does not use leaves every bit of the shapes as it is. One small sequence a case: the table says
-which constants matter at all, not which value is best.
+Constants are the numbers assigned to upper-case names at the top level of the modules in `ROOMS`. Each solve is one JSON line and is done
+only once. Changing a constant that a solve does not use leaves the shapes bit-identical. With one small sequence per case, the table shows
+which constants matter at all, not which values are best.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ ROOMS = {
     "solver/tracks": ("face", "face, given cameras"),
     "solver/isometry": ("sheet",),
 }
-"""Folders, and the cases that their constants are changed in."""
+"""Folders, and the cases in which their constants are changed."""
 
 ELSEWHERE = {
     "bas_relief": ("flag",), "planar_ambiguity": ("flag",), "focal_length": ("face, lens",), "perspective": ("face, lens",),
@@ -48,19 +48,19 @@ ELSEWHERE = {
     "resection": ("face, lens",), "completion": ("face, errors",), "noise": ("face, errors",), "observation_model": ("face, errors",),
     "observed": ("face, errors",),
 }  # fmt: skip
-"""Modules whose constants only count in other cases."""
+"""Modules whose constants matter only in other cases."""
 
 FACTORS = (2.0, 0.5)
 
 MATTERS = 1.05
-"""Ratio of the errors, either way, from which a constant matters."""
+"""Ratio of the errors, in either direction, from which a constant matters."""
 
 PATIENCE = 10.0
-"""A changed solve may take so many times the processor time of the unchanged one, and a minute more."""
+"""Processor time allowed to a changed solve, as a multiple of the unchanged solve's; one minute is added."""
 
 
 class Change(NamedTuple):
-    """One solve; without a name, the unchanged one."""
+    """One solve; an empty name means the unchanged solver."""
 
     case: str
     module: str = ""
@@ -79,7 +79,7 @@ def constants() -> Iterator[tuple[str, str, tuple[str, ...]]]:
 
 
 def changes(only: list[str]) -> list[Change]:
-    """Return every solve of constants whose module or name holds one of the words, the unchanged ones first."""
+    """Return the unchanged solves, then those of the constants whose module or name contains one of the words (all without words)."""
     found = [
         Change(case, module, name, factor)
         for module, name, cases in constants()
@@ -91,7 +91,7 @@ def changes(only: list[str]) -> list[Change]:
 
 
 def measured(change: Change, seconds: float = 0.0) -> dict[str, Any]:
-    """Return the row of one solve, `refused` where it fails or, changed, takes more than so many seconds of processor time."""
+    """Return the row of one solve, with `refused` if it fails or, when changed, exceeds `seconds` of processor time."""
     command = [sys.executable, "-m", "benchmarks.accuracy.changed_constant", change.case]
     if change.name:
         command += [change.module, change.name, str(change.factor), str(round(seconds))]
@@ -105,7 +105,7 @@ def measured(change: Change, seconds: float = 0.0) -> dict[str, Any]:
 
 
 def measure(path: Path, only: list[str], workers: int) -> None:
-    """Measure what is missing."""
+    """Append the rows of missing solves to a file, running `workers` solves in parallel."""
     done = {_change(row): row for row in rows(path)}
     wanted = [change for change in changes(only) if change not in done]
     for change in (each for each in wanted if not each.name):
@@ -124,7 +124,7 @@ def _change(row: dict[str, Any]) -> Change:
 
 
 def table(path: Path) -> str:
-    """Return the constants that matter, with the ratios of error and time, and how many do not."""
+    """Return a Markdown table of the constants that matter, with their error and time ratios, and the number of the others."""
     found = rows(path)
     unchanged = {row["case"]: row for row in found if not row["name"]}
     by_constant: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)

@@ -1,18 +1,18 @@
-"""Real sheets in pixels beside other methods: maximum depth alone (MDH), the best plane per frame, and a free surface.
+"""Compare the solver on real sheets in pixels with the maximum-depth heuristic (MDH), the best plane per frame, and a free surface.
 
     python -m benchmarks.accuracy.sheets --data DIR [--only NAME] [--methods auto,given] [--kinds clean,all,shuffled] [--out FILE]
     python -m benchmarks.accuracy.sheets --table
 
-Sequences of DIR whose truth is in camera axes and whose focal length is known. Methods:
+Uses the sequences of DIR with truth in camera axes and a known focal length. Methods:
 
 - `auto`, `given`: default settings with `image_size`, without and with the focal length
 - `free`: the same as `auto` with `surface=free`
-- `mdh`: the conic program of Chhatkuli and others (TPAMI 2018) alone, its frames weighted as `isometry.inextensible` says, with the focal
-  length, on `ANCHORS` points spread over the sheet; not on spoiled tracks, which it does not resist
-- `plane`: in every frame the plane nearest to the true shape, so that no planar method can be better
+- `mdh`: only the conic program of Chhatkuli et al. (TPAMI 2018), with frames weighted as in `isometry.inextensible` and the focal length
+  given, on `ANCHORS` points spread over the sheet; not run on spoiled tracks, to which it is not robust
+- `plane`: the plane nearest to the true shape in every frame, a lower bound for planar methods
 
 `all` adds 10 % outliers, 30 % hidden observations, noise of 1 px and drift (`benchmarks.accuracy.spoiling`); `shuffled` permutes the
-frames. The error is `e3d_frame_scaled`. Every measurement is a line of JSON in FILE and is done once.
+frames. The error is `e3d_frame_scaled`. Each measurement is one JSON line in FILE and is done once.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from benchmarks.trust import image_size
 RESULTS = Path(__file__).parent.parent / "results" / "sheets.jsonl"
 
 FOCAL = {"kinect_paper_dense23": 528.0}
-"""Focal lengths, px, of sequences whose `truth.npz` does not state them."""
+"""Focal lengths, px, of sequences whose `truth.npz` lacks them."""
 
 ANCHORS = 60
-"""Points of MDH alone, as many as the solver's own conic program has."""
+"""Number of points of `mdh`, as in the solver's own conic program."""
 
 KINDS = ("clean", "all", "shuffled")
 
@@ -76,7 +76,7 @@ def sheets(data: Path, only: list[str]) -> list[Sheet]:
 
 
 def changed(case: Case, kind: str) -> Case:
-    """Return the sequence spoiled or shuffled."""
+    """Return a spoiled or shuffled copy of a sequence."""
     if kind == "shuffled":
         order = np.random.default_rng(0).permutation(case.tracks.num_frames)
         tracks = Tracks.from_arrays(case.tracks.points[order], case.tracks.visible[order])
@@ -85,7 +85,7 @@ def changed(case: Case, kind: str) -> Case:
 
 
 def solved(sheet: Sheet, *, given: bool = False, surface: str = "auto") -> dict[str, Any]:
-    """Return error and choices of the solver."""
+    """Solve a sheet; return the error and the solver's choices."""
     settings = Settings(image_size=sheet.size, focal=sheet.focal if given else None, surface=surface)  # type: ignore[arg-type]
     solution = solve(sheet.case.tracks, sheet.case.mesh, settings=settings)
     focal = solution.camera.focal
@@ -96,7 +96,7 @@ def solved(sheet: Sheet, *, given: bool = False, surface: str = "auto") -> dict[
 
 
 def maximum_depth_alone(sheet: Sheet) -> dict[str, Any]:
-    """Return the error of MDH at its anchors, where they are seen."""
+    """Return the error of MDH at the anchors known in every frame, and their number; the error is None if the program fails."""
     points, seen = sheet.case.tracks.points, sheet.case.tracks.visible > 0
     often = np.flatnonzero(seen.mean(axis=0) >= np.quantile(seen.mean(axis=0), 0.5))
     kept = often[farthest_points(points[:, often], seen[:, often], min(ANCHORS, len(often)))]
@@ -138,7 +138,7 @@ METHODS: dict[str, Callable[[Sheet], dict[str, Any]]] = {
 
 
 def table(path: Path) -> str:
-    """Return the errors, methods across."""
+    """Return a Markdown table of the errors."""
     found = {(row["sequence"], row["kind"], row["method"]): row for row in rows(path)}
     lines = [
         "| sequence | tracks | " + " | ".join(METHODS) + " | seconds of CPU, auto |",
@@ -155,7 +155,7 @@ def table(path: Path) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure what is missing, and print the table."""
+    """Measure what is missing and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="directory of recorded sequences")
     parser.add_argument("--only", action="append", default=[], help="names that hold this word")

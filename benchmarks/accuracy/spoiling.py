@@ -1,4 +1,4 @@
-"""Errors as trackers make them, in pixels: white noise, slow drift, tracks that begin and end anywhere, outliers, hidden points."""
+"""Synthetic tracker errors in pixels: white noise, slow drift, tracks that begin and end anywhere, outliers, hidden points."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ JUMPING_SHARE = 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spoiling:
-    """What is added to the tracks, in this order."""
+    """Errors to add to tracks."""
 
     noise: float = 0.0
     """Standard deviation of white noise, px."""
 
     drift: float = 0.0
-    """Standard deviation of a step of the random walk that each track drifts by, px a frame."""
+    """Standard deviation of each track's random-walk step, px per frame."""
 
     births: bool = False
-    """Tracks begin and end anywhere, and some jump to a neighbour."""
+    """Whether tracks begin and end anywhere, and some jump to a neighbour."""
 
     outliers: float = 0.0
-    """Share of the observations that are moved anywhere within the object's bounding box."""
+    """Share of observations moved to a random place in the object's bounding box."""
 
     hidden: float = 0.0
-    """Share of the observations that are hidden at random."""
+    """Share of observations hidden at random."""
 
 
 SPOILINGS = {
@@ -45,7 +45,7 @@ SPOILINGS = {
     "hidden": Spoiling(hidden=0.3),
     "all": Spoiling(noise=1.0, drift=0.1, outliers=0.1, hidden=0.3),
 }
-"""By name; `all` is 10 % outliers, 30 % hidden, noise of 1 px and drift together."""
+"""By name; `all` combines 10 % outliers, 30 % hidden, noise of 1 px and drift."""
 
 
 def spoiled(tracks: Tracks, spoiling: Spoiling, *, seed: int = 0) -> Tracks:
@@ -69,7 +69,7 @@ def spoiled(tracks: Tracks, spoiling: Spoiling, *, seed: int = 0) -> Tracks:
 
 
 def _alive(frames: int, count: int, random: np.random.Generator) -> np.ndarray:
-    """Return which tracks are seen in which frames, `(F, P)`: one run of frames each, of exponential length, cut at the ends."""
+    """Return visibility `(F, P)`: each track is one run of frames of exponential length, clipped to the film."""
     life = np.maximum(random.exponential(LIFE_SHARE * frames, count), 2.0)
     birth = random.uniform(1 - life, frames - 1)
     frame = np.arange(frames)[:, None]
@@ -77,7 +77,7 @@ def _alive(frames: int, count: int, random: np.random.Generator) -> np.ndarray:
 
 
 def _jumped(points: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Return points of which `JUMPING_SHARE` follow their nearest neighbour from some frame on."""
+    """Return the points, with `JUMPING_SHARE` of them following their nearest neighbour from a random frame on."""
     frames, count = points.shape[:2]
     result = points.copy()
     for track in random.choice(count, round(JUMPING_SHARE * count), replace=False):

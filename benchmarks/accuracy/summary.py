@@ -1,4 +1,4 @@
-"""Measured cells summarised over their trials: one JSON line for each cell and metric, committed in `benchmarks/results`."""
+"""Summarise measured cells over their trials: one JSON line per cell and metric, committed in `benchmarks/results`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FIELDS = ("case", "frames", "points", "visibility", "cameras", "corruption", "me
 
 
 def write_summary(path: Path, rows: Iterable[dict[str, Any]]) -> None:
-    """Write mean and standard deviation over trials of every metric and of the seconds; `settings` cells are left out."""
+    """Write mean and standard deviation of every metric, and mean seconds, over the trials; skip cells with extra settings."""
     cells: dict[tuple[Any, ...], list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
         if not row["settings"]:
@@ -29,7 +29,7 @@ def write_summary(path: Path, rows: Iterable[dict[str, Any]]) -> None:
 
 
 def summarised(cell: dict[str, Any], trials: list[dict[str, Any]]) -> Iterable[dict[str, Any]]:
-    """Yield one record for each metric that a cell's trials have."""
+    """Yield one record per metric of a cell's trials."""
     for metric in dict.fromkeys(name for trial in trials for name in trial["metrics"]):
         values = [trial["metrics"][metric] for trial in trials if metric in trial["metrics"]]
         record = {**cell, "metric": metric, "mean": float(np.mean(values)), "trials": len(values)}

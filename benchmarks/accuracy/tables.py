@@ -1,4 +1,4 @@
-"""Markdown tables out of measured cells."""
+"""Markdown tables of measured cells."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Rows = Iterable[dict[str, Any]]
 
 
 def clean_table(rows: Rows, metric: str) -> str:
-    """Sequences down, true and estimated cameras × methods across, without corruption."""
+    """Return the clean results: a row per sequence, a column per camera source and method."""
     found = [row for row in rows if row["corruption"] == "clean" and metric in row["metrics"]]
     columns = [(cameras, method) for cameras in ("true", "estimated") for method in METHODS]
     columns = [column for column in columns if any(_column(row) == column for row in found)]
@@ -38,7 +38,7 @@ def clean_table(rows: Rows, metric: str) -> str:
 
 
 def corruption_table(rows: Rows, metric: str, cameras: str) -> str:
-    """Sequences and corruptions down, methods across; mean ± standard deviation over the trials."""
+    """Return mean ± standard deviation over the trials: a row per sequence and corruption, a column per method."""
     found = [row for row in rows if row["cameras"] == cameras and metric in row["metrics"]]
     groups: dict[tuple[str, str, str], list[float]] = defaultdict(list)
     for row in found:
@@ -56,7 +56,7 @@ def corruption_table(rows: Rows, metric: str, cameras: str) -> str:
 
 
 def number(value: float) -> str:
-    """Three significant digits in the field's manner: .0341, 1.25, 12.5; a dash where there is no truth to compare with."""
+    """Format three significant digits in the field's style: .0341, 1.25, 12.5; a dash if not finite."""
     if value == 0 or not np.isfinite(value):
         return "0" if value == 0 else "–"
     digits = max(0, 2 - int(np.floor(np.log10(abs(value)))))

@@ -1,11 +1,11 @@
-"""Compare what Blender's camera sees with the pixels of the result.
+"""Compare the view of Blender's imported camera with the pixel positions of the result.
 
     pip install bpy          # in an environment of its own; Blender as a Python module, 350 MB
     python benchmarks/figures/blender_camera.py RESULT/shapes.glb RESULT/shapes.npz [--fps 30] [--y-up]
 
 Imports the mesh and its animated camera, projects every vertex of every frame with `bpy_extras.object_utils.world_to_camera_view`, and
-prints the largest distance, in pixels, from the position that the cameras in `shapes.npz` project it to. Exits with 1 above `--limit`.
-Uses no part of Pliant.
+prints the largest distance, in pixels, from its projection by the cameras in `shapes.npz`. Exits with 1 above `--limit`. Does not import
+Pliant.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def curve_start(action: bpy.types.Action) -> float:
 
 
 def seen_in(scene: bpy.types.Scene, camera: bpy.types.Object, shape: bpy.types.Object) -> np.ndarray:
-    """Return where the vertices of the deformed mesh are in the view, 0 to 1 from the lower left corner, shape `(V, 2)`."""
+    """Return view coordinates of the deformed mesh's vertices, 0 to 1 from the lower left corner, shape `(V, 2)`."""
     graph = bpy.context.evaluated_depsgraph_get()
     posed = shape.evaluated_get(graph)
     mesh = posed.to_mesh()
@@ -72,14 +72,14 @@ def seen_in(scene: bpy.types.Scene, camera: bpy.types.Object, shape: bpy.types.O
 
 
 def nearest_distances(found: np.ndarray, expected: np.ndarray) -> float:
-    """Return the largest distance of a found position from an expected one; with equal numbers, vertex i is point i."""
+    """Return the largest distance from an expected position to its vertex, or to the nearest vertex if the numbers differ."""
     if len(found) == len(expected):
         return float(np.hypot(*(found - expected).T).max())
     return float(np.hypot(*(found[:, None] - expected[None]).T).min(axis=0).max())
 
 
 def projected(path: Path, *, y_up: bool) -> np.ndarray:
-    """Return the pixels of every point and frame, by the cameras of `shapes.npz`, shape `(F, P, 2)`."""
+    """Project every point of every frame with the cameras of `shapes.npz`; return pixels, shape `(F, P, 2)`."""
     with np.load(path) as file:
         shapes, rotations, scales = file["shapes"], file["rotations"], file["scales"]
         translations, focal, point = file["translations"], float(file["focal"]), file["principal_point"]
@@ -90,7 +90,7 @@ def projected(path: Path, *, y_up: bool) -> np.ndarray:
 
 
 def view_of(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre and size of the view in pixels, which the file states in the camera's `extras`."""
+    """Return centre and size of the view in pixels, from the camera's `extras`."""
     data = path.read_bytes()
     (length,) = struct.unpack("<I", data[12:16])
     stated = json.loads(data[20 : 20 + length])["cameras"][0]["extras"]["pliant"]

@@ -3,7 +3,7 @@
     pip install bpy          # in an environment of its own; Blender as a Python module, 350 MB
     python benchmarks/figures/blender_picture.py RESULT/shapes.glb PICTURE [--frames 3] [--height 240] [--side 35]
 
-Uses no part of Pliant. The steps are those of the tutorial: set the frame rate, import, play.
+Does not import Pliant. Follows the tutorial: set the frame rate, import, play.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mathutils import Vector
 from PIL import Image
 
 SAMPLES = 24
-"""Light paths for each pixel: enough for matt surfaces with a denoiser's help or without."""
+"""Light paths per pixel: enough for matt surfaces, with or without a denoiser."""
 
 
 def main() -> None:

@@ -41,14 +41,14 @@ def main() -> None:
 
 
 def empty(fps: float) -> None:
-    """An empty scene at the job's frame rate: Blender counts in frames, glTF in seconds."""
+    """Start an empty scene at the job's frame rate: Blender counts in frames, glTF in seconds."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.context.scene.render.fps = round(fps)
     bpy.context.scene.render.fps_base = round(fps) / fps
 
 
 def animated(frames: list[int]) -> np.ndarray:
-    """World positions `(len(frames), P, 3)` of the only mesh. glTF's first frame is frame 0 on Blender's timeline."""
+    """Return world positions `(len(frames), P, 3)` of the only mesh; glTF's first frame is frame 0 on Blender's timeline."""
     made = []
     for frame in frames:
         bpy.context.scene.frame_set(frame)

@@ -2,8 +2,8 @@
 
     python -m benchmarks.figures.film_pictures RESULT --film FILM [--at 0,15,29] [--side 40] [--plain] -o PICTURE
 
-RESULT is the folder of `pliant solve FILM` or `pliant demo` (`tracks.npz`, `shapes.npz`). `--plain` leaves the film and its texture out,
-for films whose pictures may not be shown: the mesh from the front, from one side and from the other.
+RESULT is the folder of `pliant solve FILM` or `pliant demo` (`tracks.npz`, `shapes.npz`). `--plain` omits the film and its texture, for
+films that may not be shown, and draws the mesh from the front and from both sides.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pliant.tracking import open_film
 from benchmarks.figures.shading import draw_mesh
 
 SPLIT = 4
-"""Parts of a quad's side in drawings, so that the texture is sharper than the mesh."""
+"""Subdivisions of a quad's side in drawings, so that the texture is sharper than the mesh."""
 
 GAP = 6
 """Pixels between pictures."""
@@ -31,7 +31,7 @@ SHADE = 0.75
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Result:
-    """What is drawn; world axes x right, y down, z away from the viewer."""
+    """A film's result; world axes x right, y down, z away from the viewer."""
 
     shapes: np.ndarray
     faces: np.ndarray
@@ -39,11 +39,11 @@ class Result:
     uv: np.ndarray
     texture: np.ndarray
     frames: np.ndarray
-    """Numbers in the film of the F frames."""
+    """Numbers of the F frames in the film."""
 
 
 def read_result(folder: Path) -> Result:
-    """Read the two files of a film's result."""
+    """Read `shapes.npz` and `tracks.npz` of a film's result."""
     with np.load(folder / "shapes.npz") as solved, np.load(folder / "tracks.npz") as tracked:
         kept = solved.get("source_points", np.arange(tracked["tracks"].shape[1]))
         focal = float(solved["focal"])
@@ -59,7 +59,7 @@ def read_result(folder: Path) -> Result:
 def draw(result: Result, film: Path | None, frames: list[int], *, side: float, height: int) -> Image.Image:
     """Draw a row of pictures for each frame, `height` pixels high, seen from `side` degrees beside the camera.
 
-    Without its film: the mesh alone, from three directions.
+    Without a film, draw only the mesh, from three directions.
     """
     rows = []
     pictures = {} if film is None else _film_frames(film, {int(result.frames[frame]) for frame in frames})
@@ -86,7 +86,7 @@ def _scaled(picture: np.ndarray, height: int) -> np.ndarray:
 
 
 def _over(result: Result, frame: int, picture: np.ndarray) -> np.ndarray:
-    """Draw the mesh over a picture, where the estimated camera sees it."""
+    """Draw the mesh over a picture, as the estimated camera sees it."""
     shape = result.shapes[frame : frame + 1]
     camera = result.camera.at(slice(frame, frame + 1))
     pixels, depths = camera.project(shape)[0], camera.depths(shape)[0]
@@ -121,7 +121,7 @@ def _aside(result: Result, frame: int, side: float, height: int, *, textured: bo
 
 
 def _split(points: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split every quad into SPLIT × SPLIT by bilinear interpolation of places and texture coordinates."""
+    """Split every quad into SPLIT × SPLIT, interpolating positions and texture coordinates bilinearly."""
     if faces.shape[1] != 4:
         return points, faces, uv
     step = np.linspace(0, 1, SPLIT + 1)
@@ -147,7 +147,7 @@ def _sampled(texture: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def _joined(pictures: list[np.ndarray], *, axis: int) -> np.ndarray:
-    """Put pictures side by side (axis 1) or below one another (axis 0), in the middle of equally large white cells."""
+    """Join pictures side by side (axis 1) or one below the other (axis 0), centred on white."""
     other = 1 - axis
     largest = max(picture.shape[other] for picture in pictures)
     parts = []

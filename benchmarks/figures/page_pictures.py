@@ -1,10 +1,10 @@
-"""Pictures of the page in nine states, at 1280×800 and 390×844, light and dark, on a real local service.
+"""Take pictures of the web page in nine states, at 1280×800 and 390×844, light and dark, from a real local service.
 
     python -m benchmarks.figures.page_pictures FOLDER
     python -m benchmarks.figures.page_pictures FOLDER --only running,share --whole
 
-Writes FOLDER/STATE-WIDTH-SCHEME.png, 36 pictures: what a window of that size shows first, or with `--whole` the whole page. Needs a
-Chromium, the built page (`python build_page.py`) and, for the film, `pliant[film]`.
+Writes FOLDER/STATE-WIDTH-SCHEME.png, 36 pictures of the visible part of the window, or with `--whole` of the whole page. Needs a Chromium,
+the built page (`python build_page.py`) and, for the film, `pliant[film]`.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ VIEWS = ((1280, 800, 1), (390, 844, 2))
 """Width, height and density of the windows."""
 
 PATIENCE = 600_000
-"""Milliseconds until a job's result is shown."""
+"""Maximum time until a job's result is shown, ms."""
 
 
 @dataclass(frozen=True, slots=True)
 class Jobs:
-    """Addresses of the jobs that the states show."""
+    """Ids of the jobs that the states show; `shared` is the path of a share link."""
 
     good: str
     care: str
@@ -65,7 +65,7 @@ def dropped_files(page: Page, url: str, jobs: Jobs) -> None:
     sequence = face(30, 400, degrees=40)
     drop(page, {"tracks.npz": packed(tracks=sequence.tracks.points), "mesh.npz": packed(faces=sequence.mesh.faces)})
     page.get_by_role("img", name="Sample of the tracks").wait_for()
-    if page.viewport_size is not None and page.viewport_size["width"] < 800:  # there, files are chosen in the form
+    if page.viewport_size is not None and page.viewport_size["width"] < 800:  # narrow windows use the form
         page.get_by_role("region", name="How your files are interpreted").scroll_into_view_if_needed()
 
 
@@ -119,9 +119,9 @@ def film_strip(page: Page, url: str, jobs: Jobs) -> None:
 
 
 def share_link(page: Page, url: str, jobs: Jobs) -> None:
-    page.goto("about:blank")  # otherwise only the part after # changes
+    page.goto("about:blank")  # otherwise only the URL's fragment changes
     page.goto(f"{url}/{jobs.shared.removeprefix('/')}")
-    page.get_by_text("You see a shared result, read-only.").wait_for()
+    page.get_by_text("This is a shared, read-only result.").wait_for()
     page.locator(".view canvas").first.wait_for(timeout=PATIENCE)
     at_frame(page, 12)
 
@@ -140,7 +140,7 @@ STATES = (
 
 
 def main() -> None:
-    """Start a service, let it solve what the states show, and take the pictures."""
+    """Start a service, solve the jobs that the states show, and take the pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--only", default="", help="names of states, separated by commas")
@@ -158,7 +158,7 @@ def main() -> None:
 
 
 def submitted(client: Client) -> Jobs:
-    """Have all results made, and one job that is still running."""
+    """Solve all jobs, and submit one that keeps running."""
     whole = face(30, 600, degrees=40)
     good = solved(client, whole, "face")
     other = solved(client, corrupt(whole, noise=0.02), "face, noisy")
@@ -187,7 +187,7 @@ def solved(client: Client, sequence: Sequence, name: str) -> str:
 
 
 def take(browser: Browser, url: str, jobs: Jobs, state: State, folder: Path, *, whole: bool) -> None:
-    """Take a state's pictures, each in a context of its own, as a new visitor sees it."""
+    """Take a state's pictures, each in a new browser context, as a first-time visitor sees it."""
     for width, height, density in VIEWS:
         for scheme in ("light", "dark"):
             context = browser.new_context(

@@ -1,13 +1,13 @@
-"""Pictures: input tracks, truth and reconstruction side by side, the error as colour, at several frames.
+"""Draw input tracks, truth and reconstruction side by side at several frames, with the error as colour.
 
     python -m benchmarks.figures.pictures                              the gallery
     python -m benchmarks.figures.pictures --data DIR --only face --frames 4
     python -m benchmarks.figures.pictures --data DIR --only samba --at 0,40,80 --camera film --full 40
     python -m benchmarks.figures.pictures --outliers .1 --side 50
 
-Surfaces are seen from one fixed place, the cameras' mean, or with `--camera film` from beside each frame's own camera. Without truth the
-reconstruction stands alone, coloured by its reprojection residual. Needs matplotlib (`pip install matplotlib`) for the frame around the
-drawings; the drawings are `benchmarks.figures.shading`'s.
+Surfaces are seen from `--side` degrees beside the mean camera, or with `--camera film` beside each frame's own camera. Without truth, only
+the reconstruction is drawn, coloured by its reprojection residual. Needs matplotlib (`pip install matplotlib`) for layout and labels;
+`benchmarks.figures.shading` draws the surfaces.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ FILL = 0.92
 """Share of a picture that the largest frame fills."""
 
 FULL_OF_TRUTH, FULL_OF_RESIDUAL = 15.0, 3.0
-"""Per cent of the RMS radius that get the brightest colour, unless told."""
+"""Errors that get the brightest colour by default, per cent of the RMS radius."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What is drawn of a sequence: x right, y down, z away from the viewer."""
+    """A sequence to draw: x right, y down, z away from the viewer."""
 
     ours: np.ndarray
     """Shape (F, P, 3)."""
@@ -53,7 +53,7 @@ class Scene:
     """Shape (F, P), the error as a share of the frame's RMS radius."""
 
     quantity: str
-    """What the share is, in words."""
+    """Name of the quantity in `share`."""
 
     relative: np.ndarray | None
     """Shape (F,), relative error of every frame; None without truth."""
@@ -79,7 +79,7 @@ def main() -> None:
 
 
 def scene_of(case: Case, solution: Solution, *, fixed: bool, side: float) -> Scene:
-    """Turn ours and the truth to the viewer: from the mean of the cameras or each frame's own, and `side` degrees from it."""
+    """Rotate reconstruction and truth to a view from `side` degrees beside the mean camera, or beside each frame's own camera."""
     if case.shapes is None:
         ours, truth, relative = solution.shapes, None, None
         turns, error, quantity = solution.camera.rotations, solution.residuals, "reprojection residual"
@@ -101,9 +101,9 @@ def scene_of(case: Case, solution: Solution, *, fixed: bool, side: float) -> Sce
 def picture(
     case: Case, scene: Scene, path: Path, *, frames: list[int], full: float | None, view: str, title: str
 ) -> None:
-    """Draw some frames: a row each, with the tracks as they came in, the truth, ours, and ours in the error's colours.
+    """Draw one row per frame: input tracks, truth, reconstruction, and the reconstruction coloured by its error.
 
-    The columns but the first share one view and one scale; `full` per cent of the RMS radius and above get the brightest colour.
+    All columns but the first share one view and one scale; errors of `full` per cent of the RMS radius and above get the brightest colour.
     """
     full = full or (FULL_OF_RESIDUAL if scene.truth is None else FULL_OF_TRUTH)
     largest = scene.ours if scene.truth is None else scene.truth
@@ -145,7 +145,7 @@ def picture(
 
 
 def title(case: Case, solution: Solution, seconds: float) -> str:
-    """Return the sequence and how well it came out, in a line."""
+    """Return one line with the sequence's name and size, the time, and the errors."""
     frames, points, _ = solution.shapes.shape
     said = f"{case.name}, {frames} × {points}, {1 - (case.tracks.visible > 0).mean():.0%} hidden, {seconds:.0f} s"
     if case.shapes is None:
@@ -156,7 +156,7 @@ def title(case: Case, solution: Solution, seconds: float) -> str:
 
 
 def _tracks(case: Case, frame: int) -> np.ndarray:
-    """The visible tracks, at a scale of their own: their unit need not be the truth's, and outliers must not shrink them."""
+    """Draw the visible tracks at their own scale: their unit may differ from the truth's, and outliers must not shrink them."""
     tracks: Tracks = case.tracks
     seen = tracks.visible > 0
     middles = [

@@ -78,13 +78,13 @@ def main() -> None:
 
 
 def read(name: str) -> Records:
-    """Return the records of one results file; none if it does not exist."""
+    """Return the records of one results file; an empty list if it does not exist."""
     path = RESULTS / f"{name}.jsonl"
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
 def error_by_sequence(records: Records) -> Figure:
-    """Error of every method on every sequence; published figures are ticks, other authors' methods on the same points hollow."""
+    """Plot the error of every method by sequence; published figures are ticks, other authors' methods hollow markers."""
     chosen = [
         r for r in records
         if r["metric"] == "e3d_frame" and r["cameras"] == "estimated" and r["corruption"] == "clean"
@@ -102,7 +102,7 @@ def error_by_sequence(records: Records) -> Figure:
     for r in read("peers"):
         if r["method"] in PEERS and r["metric"] == "e3d_frame" and (r["sequence"], r["points"]) in measured:
             least = peers[r["method"]].get(r["sequence"], np.inf)
-            peers[r["method"]][r["sequence"]] = min(least, r["value"])  # over the numbers of bases
+            peers[r["method"]][r["sequence"]] = min(least, r["value"])  # of the numbers of bases
     for method, found in peers.items():
         label, marker = PEERS[method]
         at = [names.index(name) for name in found]
@@ -130,7 +130,7 @@ def error_by_sequence(records: Records) -> Figure:
 
 
 def error_by_corruption(records: Records) -> Figure:
-    """Error against noise, outliers and hidden points on the sequences that were corrupted."""
+    """Plot error against noise, outliers and hidden points for the corrupted sequences."""
     chosen = [
         r for r in records
         if r["metric"] == "e3d_frame" and r["cameras"] == "estimated" and r["visibility"] == "file" and r["points"] <= 1000
@@ -168,7 +168,7 @@ def _against(axes: Axes, records: Records, levels: dict[str, float]) -> None:
 
 
 def error_by_level(records: Records) -> Figure:
-    """Error of the default against the level of each spoiling: every draw, and their mean."""
+    """Plot the default's error against the level of each corruption: every draw, and the mean."""
     figure, panels = plt.subplots(1, 3, figsize=(8, 3), sharey=True)
     for axes, (spoiling, words) in zip(
         panels, (("outliers", "share of outliers"), ("hidden", "share hidden"), ("noise", "noise r")), strict=True
@@ -193,7 +193,7 @@ def error_by_level(records: Records) -> Figure:
 
 
 def growth(records: Records) -> Figure:
-    """Time and memory against points and frames, with the fitted exponents."""
+    """Plot time and memory against points and frames, with the fitted exponents of time."""
     figure, grid = plt.subplots(1, 2, figsize=(8, 4.2))
     for axes, quantity, label in zip(grid, ("seconds", "gigabytes"), ("wall time, s", "peak memory, GB"), strict=True):
         series: dict[tuple[str, str, str], list[tuple[float, float]]] = defaultdict(list)
@@ -207,7 +207,7 @@ def growth(records: Records) -> Figure:
         for (against, at, prior), points in sorted(series.items()):
             x, y = np.array(sorted(points)).T
             label_of = f"{against} at {at}, {prior}"
-            if quantity == "seconds":  # memory holds a constant, so that a slope says little about it
+            if quantity == "seconds":  # memory has a constant part, so its slope means little
                 label_of += f": slope {np.polyfit(np.log(x), np.log(y), 1)[0]:.2f}"
             axes.loglog(x, y, marker="o", ms=4, label=label_of)
         axes.set_xlabel("points, or frames")
@@ -219,7 +219,7 @@ def growth(records: Records) -> Figure:
 
 
 def baselines(records: Records) -> Figure:
-    """Time to within 1 % of the final energy beside other minimisers."""
+    """Plot the time to reach within 1 % of the final energy, beside other minimisers."""
     figure, axes = plt.subplots(figsize=(6.5, 1.8))
     axes.barh([r["solver"] for r in records], [r["seconds"] for r in records], color="#4477aa")
     for at, r in enumerate(records):
@@ -232,7 +232,7 @@ def baselines(records: Records) -> Figure:
 
 
 def distance(records: Records) -> Figure:
-    """Error against the distance of the camera, infinite for orthography; of each sequence with the most points measured."""
+    """Plot error against camera distance (infinite: orthography), for each sequence at its largest number of points."""
     places = {"3": 0, "5": 1, "10": 2, "inf": 3}
     chosen = [r for r in records if r["metric"] == "e3d_frame_scaled" and len(r["sequence"].split()) == 2]
     titles = {"orthographic": "orthographic camera model", "auto": "camera=auto (default), φ not given"}
@@ -257,7 +257,7 @@ def distance(records: Records) -> Figure:
 
 
 def progress(records: Records) -> Figure:
-    """Seconds left as shown against the true ones, each run as shares of its duration."""
+    """Plot displayed against true remaining time, as fractions of each run's duration."""
     figure, axes = plt.subplots(figsize=(6.5, 4))
     ends = np.array([0.0, 1.0])
     axes.fill_between(ends, (1 - ends) / 2, (1 - ends) * 2, color="#dddddd", label="within a factor of two")
@@ -292,7 +292,7 @@ FIGURES: dict[str, tuple[str, Callable[[Records], Figure]]] = {
     "error-by-distance": ("distances", distance),
     "seconds-left": ("progress", progress),
 }
-"""Name of the picture → results it is drawn from, and how."""
+"""Results file and drawing function of each picture."""
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Shaded, coloured meshes and points as pictures; the tracker's rasteriser finds what each pixel shows."""
+"""Draw shaded, coloured meshes and points, using the tracker's rasteriser."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ LIGHTS = (((-0.55, -0.65, -0.60), 0.52), ((0.80, -0.05, -0.60), 0.20), ((0.0, 0.
 """Directions towards the light (x right, y down, z away from the viewer) and strengths: a key, a fill, and one beside the eye."""
 AMBIENT = 0.14
 COLOURED = 0.45
-"""Share of the shading that is kept where colours mean something, so that dark stays the scale's dark."""
+"""Share of the shading kept where colours encode values, so that shading is not mistaken for the dark end of the scale."""
 SUPERSAMPLING = 2
 GREY = 0.86
 FAR = 1e6
@@ -36,7 +36,7 @@ def draw_mesh(
     triangles = triangulate(faces)
     normals = _vertex_normals(points, triangles)
     screen = (points[:, :2] - centre) * (scale * fine) + ((width - 1) / 2, (height - 1) / 2)
-    # Depths that differ by a millionth of themselves make the perspective of the rasteriser vanish.
+    # A distance of a million depths makes the rasteriser's perspective negligible.
     near = points[:, 2] - points[:, 2].min()
     shown = rasterise(screen, near + FAR * max(float(near.max()), 1e-9), triangles, size=(width, height))
     hit = np.flatnonzero(shown.triangle >= 0)
@@ -59,7 +59,7 @@ def draw_points(
     colours: np.ndarray | None = None,
     radius: int = 1,
 ) -> np.ndarray:
-    """Draw points as small squares, nearest (smallest z, where there is one) on top."""
+    """Draw points as small squares, the nearest (smallest z, if there is one) on top; return `(height, width, 3)` in [0, 1]."""
     height, width = size
     image = np.ones((height, width, 3))
     order = np.argsort(-points[:, 2]) if points.shape[1] == 3 else np.arange(len(points))

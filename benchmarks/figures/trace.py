@@ -1,6 +1,6 @@
 """Draw the trace of one job over API, queue, worker and solver, and print its log lines: `python -m benchmarks.figures.trace`.
 
-API and worker are processes of their own, which print their spans and log lines. The picture is docs/images/trace.svg.
+API and worker are separate processes, which print their spans and log lines. The picture is written to docs/images/trace.svg.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pliant.worker.settings import Settings
 
 IMAGE = Path(__file__).parents[2] / "docs" / "images" / "trace.svg"
 WIDTH, LEFT, ROW = 860, 190, 26
-"""Of the picture, in pixels."""
+"""Layout of the picture, in pixels."""
 
 COLOURS = {"API": "#3b6fb6", "queue": "#b0b7c3", "worker": "#2f8f6b", "solver": "#d08a2e"}
 
@@ -45,7 +45,7 @@ class Span:
 
     @property
     def place(self) -> str:
-        """Where the time was spent."""
+        """Component that spent the time: API, queue, worker or solver."""
         if self.service == "pliant-api":
             return "API"
         worker = {"queued": "queue", "attempt": "worker", "loading": "worker", "exporting": "worker"}
@@ -101,7 +101,7 @@ def read_spans(text: str) -> list[tuple[str, Span]]:
 
 
 def draw(spans: list[Span]) -> str:
-    """Return the picture of a trace: a bar for each span, the seconds along it."""
+    """Return an SVG picture of a trace: a bar with its duration for each span."""
     spans = sorted(spans, key=lambda each: (each.begin, -each.end))
     first, last = min(each.begin for each in spans), max(each.end for each in spans)
     scale = (WIDTH - LEFT - 90) / (last - first)
@@ -129,7 +129,7 @@ def _seconds(duration: float) -> str:
 
 
 def lines_of(job: str, text: str) -> list[str]:
-    """Return the log lines of one job, without the parts that differ between machines."""
+    """Return the log lines of one job, without machine-dependent path prefixes."""
     kept = [line for line in text.splitlines() if job in line]
     return [re.sub(r"/\S*/(data|incoming)/", r"\1/", line) for line in kept]
 

@@ -1,4 +1,4 @@
-"""Memory and processor time of whole jobs against their size, beside the estimate: `python -m benchmarks.installation.cost`."""
+"""Compare memory and processor time of whole jobs with their estimates: `python -m benchmarks.installation.cost`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SIZES = (
 
 
 def measure(frames: int, points: int) -> None:
-    """Run one job in this process, and print what it took."""
+    """Run one job in this process; print its peak memory and processor time."""
     sequence = gallery.corrupt(gallery.face(frames, points), noise=0.5)
     count = sequence.tracks.num_points
     stated = Interpretation(
@@ -47,7 +47,7 @@ def measure(frames: int, points: int) -> None:
 
 
 def main() -> None:
-    """Measure every size in a process of its own."""
+    """Measure every size in a separate process."""
     print(f"{'frames × points':>17} {'peak, MB':>9} {'estimate':>9} {'seconds':>9} {'estimate':>9}")
     for frames, points in SIZES:
         command = [sys.executable, "-m", "benchmarks.installation.cost", str(frames), str(points)]

@@ -1,4 +1,4 @@
-"""Faults that hit those who do the work: job_processes, workers, the reconciler, Valkey, the job itself."""
+"""Faults in job processes, workers, the reconciler, Valkey, and the job itself."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def job_process_writing(instance: Instance) -> Outcome:
 
 
 TRIES = 8
-"""Jobs of which at least one is hit in the moment in which it stores its files."""
+"""Maximum number of jobs until one is hit while it stores its files."""
 
 
 @fault("kill -9 the job process while it stores its files")
@@ -54,7 +54,7 @@ def job_process_storing(instance: Instance) -> Outcome:
         blobs = instance.settings.data / "blobs"
         attempt = instance.settings.work / instance.jobs.records.get(id).attempt_id
         instance.until(lambda at=attempt: any(at.glob("artifacts/*")), "a file is begun")
-        # Storing takes milliseconds: the process is let run by the half of one, until its first file is seen.
+        # Storing takes milliseconds, so the process runs in steps of half a millisecond until its first file appears.
         for process in instance.look()["job process"]:
             with suppress(ProcessLookupError):
                 while not any(blobs.glob(f"{prefix}*/artifacts/*")):
@@ -67,7 +67,7 @@ def job_process_storing(instance: Instance) -> Outcome:
         if job.status is Status.FAILED:
             assert job.artifacts == []
             return Outcome(f"{status_of(job)}, no file visible", time.monotonic() - began)
-        assert job.status is Status.SUCCEEDED  # it was done before it was hit
+        assert job.status is Status.SUCCEEDED  # it finished before the signal
         assert job.artifacts != []
     raise AssertionError(f"none of {TRIES} jobs was hit while it stored its files")
 
@@ -102,14 +102,14 @@ def valkey(instance: Instance) -> Outcome:
     time.sleep(0.1)
     seconds = instance.until(lambda: instance.jobs.get(id).status is Status.RUNNING, "it answers again")
     before = instance.jobs.get(id).progress
-    instance.until(lambda: instance.jobs.get(id).progress != before, "the job goes on telling")
+    instance.until(lambda: instance.jobs.get(id).progress != before, "the job keeps reporting progress")
     assert instance.jobs.get(id).attempt == 1
     cancelled(instance, id)
     return Outcome("running, attempt 1 (cancelled then)", seconds)
 
 
 AWAY = [4.0]
-"""Seconds that Valkey is away; the command sets it."""
+"""Seconds of Valkey's outage; set by the command line."""
 
 
 @fault("Valkey hangs (SIGSTOP) in mid solve")
@@ -121,7 +121,7 @@ def valkey_hangs(instance: Instance) -> Outcome:
     time.sleep(AWAY[0])
     os.kill(pid, signal.SIGCONT)
     before = instance.jobs.get(id).progress
-    instance.until(lambda: instance.jobs.get(id).progress != before, "the job goes on telling")
+    instance.until(lambda: instance.jobs.get(id).progress != before, "the job keeps reporting progress")
     assert instance.jobs.get(id).attempt == 1, "an outage is no reason to begin a job anew"
     seconds = time.monotonic() - began
     cancelled(instance, id)
@@ -189,7 +189,7 @@ def twice(instance: Instance) -> Outcome:
 
 
 def cancel_at(stage: str) -> Fault:
-    """Return the fault of cancelling a job in a stage."""
+    """Register the fault of cancelling a job in a stage."""
 
     def cancel(instance: Instance) -> Outcome:
         blockers = [submitted(instance, options=LONG) for _ in range(2)] if stage == "queued" else []
@@ -211,7 +211,7 @@ def cancel_at(stage: str) -> Fault:
 
 
 def _in_stage(instance: Instance, stage: str) -> str:
-    """Submit a job that is long enough in a stage to be met there."""
+    """Submit a job that spends long enough in a stage to be cancelled there."""
     if stage == "cameras":
         with instance.client() as client:
             job = client.submit(face(80, 6000).tracks.points, mesh="none", options=SHORT, timeout=120)
@@ -228,7 +228,7 @@ for _stage in ("queued", "loading", "cameras", "reweight", "exporting"):
 
 @fault("an array larger than the memory that a job may take (RLIMIT_AS)")
 def memory(instance: Instance) -> Outcome:
-    """On an installation of its own, with PLIANT_MEMORY_LIMIT."""
+    """Run on a separate installation with PLIANT_MEMORY_LIMIT."""
     lean = Instance(instance.folder / "lean", chosen=replace(SOON, memory_limit=700 << 20), workers=1)
     with lean:
         began = time.monotonic()

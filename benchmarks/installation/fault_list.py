@@ -1,4 +1,4 @@
-"""The list of faults, and functions that they share."""
+"""The list of faults, and functions that the faults share."""
 
 from __future__ import annotations
 

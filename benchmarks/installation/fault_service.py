@@ -1,4 +1,4 @@
-"""Faults that hit the API, or everything at once."""
+"""Faults in the API, or in all processes at once."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def api_downloading(instance: Instance) -> Outcome:
         path = client.download(id, folder, names=["shapes.npz"], on_download=kill, timeout=240)["shapes.npz"]
         about = next(each for each in instance.jobs.get(id).artifacts if each.name == "shapes.npz")
         assert hashlib.sha256(path.read_bytes()).hexdigest() == about.sha256
-    return Outcome("the file is whole and right", time.monotonic() - killed[0])
+    return Outcome("the file is complete and correct", time.monotonic() - killed[0])
 
 
 @fault("kill -9 everything in mid solve, and start it again")

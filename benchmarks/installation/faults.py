@@ -1,9 +1,9 @@
-"""Faults on a real installation: every kind of process is killed at different times; state of the record afterwards, and losses.
+"""Inject faults into a real installation: kill every kind of process at different times; report the job record and any losses.
 
     python -m benchmarks.installation.faults
 
-Prints a table. After each fault the stored data are compared with the job records (as by `pliant fsck`), the
-list of jobs with the acknowledged ones, and the process table with the started processes. Exits with 1 on any mismatch.
+Prints a table. After each fault, compares the stored data with the job records (as `pliant fsck` does), the list of jobs with the
+acknowledged ones, and the process table with the started processes. Exits with 1 on any mismatch.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def main() -> int:
     """Inject every fault, print the table; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--away", type=float, default=30.0, help="seconds that Valkey is away")
-    parser.add_argument("--only", default="", help="names, commas between them: " + ", ".join(FAULTS))
+    parser.add_argument("--only", default="", help="names, separated by commas: " + ", ".join(FAULTS))
     parser.add_argument("--into", type=Path, help="a document whose table of faults is to be replaced by this one")
     given = parser.parse_args()
     fault_jobs.AWAY[0] = given.away
@@ -52,7 +52,7 @@ def main() -> int:
 
 
 def replace_table(document: Path, rows: list[str]) -> None:
-    """Put the table in the place of the one that the document has."""
+    """Replace the table of faults in a document."""
     lines = document.read_text().splitlines()
     begin = lines.index(HEAD)
     end = next(number for number in range(begin, len(lines) + 1) if number == len(lines) or not lines[number])

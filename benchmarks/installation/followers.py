@@ -1,4 +1,4 @@
-"""Many clients follow the events of one job, while a process of its own reads its status without pause.
+"""Let many clients follow the events of one job, while a separate process polls its status.
 
 python -m benchmarks.installation.loops
 """
@@ -22,13 +22,13 @@ PAUSE = 0.02
 """Seconds between two status reads."""
 
 WITHIN = 60.0
-"""Seconds for all followers to connect, and for all streams to end after the job."""
+"""Time limit for all followers to connect, and for all streams to end after the job, s."""
 
 
 def read_statuses(
     host: str, port: int, path: str, started: Event, ended: Event, results: multiprocessing.Queue[list[float]]
 ) -> None:
-    """Read a job's status until `ended`, and put the seconds of each read into `results`."""
+    """Poll a job's status until `ended`, and put the seconds of each read into `results`."""
     spent: list[float] = []
     connection = http.client.HTTPConnection(host, port, timeout=60)
     while not ended.is_set():
@@ -62,7 +62,7 @@ async def follow(host: str, port: int, path: str, connected: asyncio.Semaphore) 
 
 
 def followers(instance: Instance, *, number: int, seconds: float) -> int:
-    """Let many clients follow one job, print a table, and return the number of streams that were lost."""
+    """Let many clients follow one job, print a table, and return the number of lost streams."""
     sequence = long_sequence()
     with instance.client() as client:
         long = client.submit(sequence.tracks.points, mesh="none", rotations=sequence.rotations, options=LONG).id

@@ -1,7 +1,7 @@
-"""Seconds until each route answers while a store hangs, and how long status reads take meanwhile: `python -m benchmarks.installation.hang`.
+"""Measure how long routes and status reads take while a store hangs: `python -m benchmarks.installation.hang`.
 
-The stores are on this machine. S3 is a socket whose queue of connections is full, so the kernel drops each attempt to connect
-(dropped), or a port where nobody listens (refused); Valkey is stopped with SIGSTOP (dropped).
+The stores are on this machine. S3 is a socket with a full connection queue, so that the kernel drops each connection attempt (dropped), or
+a port without a listener (refused). Valkey is stopped with SIGSTOP (dropped).
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from pliant.worker.processes.valkey import Valkey
 from pliant.worker.settings import Settings
 
 WAITING = 50
-"""Requests that need the hanging store, while status reads are timed."""
+"""Requests that wait for the hanging store while status reads are timed."""
 
 
 @contextmanager
 def dropping() -> Iterator[int]:
-    """Yield a port whose connections are neither accepted nor refused."""
+    """Yield a port that neither accepts nor refuses connections."""
     with socket.socket() as full:
         full.bind(("127.0.0.1", 0))
         full.listen(0)
@@ -51,7 +51,7 @@ def dropping() -> Iterator[int]:
 
 
 def free_port() -> int:
-    """Return a port where nobody listens."""
+    """Return a port without a listener."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -94,7 +94,7 @@ def routes(id: str) -> dict[str, tuple[str, str, dict[str, object]]]:
 
 
 def timed(url: str, id: str) -> tuple[dict[str, str], str]:
-    """Return the seconds and status of each route, and median and maximum of status reads while others wait for the store."""
+    """Return seconds and status of each route, and median and maximum of status reads while other requests wait for the store."""
     answers = {}
     for name, (method, path, more) in routes(id).items():
         began = time.monotonic()
@@ -148,7 +148,7 @@ def main() -> None:
 
 
 def _failed(settings: Settings) -> str:
-    """Make a cancelled job, which can be run again."""
+    """Submit and cancel a job, so that it can be retried; return its id."""
     jobs = Jobs.open(settings)
     stated = Interpretation(
         num_frames=4, num_points=4, num_faces=0, hidden_fraction=0, mesh_source="none", has_ground_truth=False,

@@ -32,12 +32,12 @@ ROLES = {"service": b"pliant.service", "worker": b"pliant.worker\0work", "reconc
 
 @dataclass
 class Instance:
-    """`pliant up` on one data directory; in `with`. It is started again at the same port after `kill_all` or `stop`."""
+    """`pliant up` on one data directory, as a context manager; `start` after `kill_all` or `stop` reuses the port."""
 
     folder: Path
     chosen: Settings = SOON
     of_service: Mapping[str, str] = field(default_factory=dict)
-    """Variables of the service itself."""
+    """Additional environment variables of `pliant up`."""
     workers: int = 2
     port: int = 0
     url: str = ""
@@ -59,20 +59,20 @@ class Instance:
 
     @property
     def settings(self) -> Settings:
-        """How it is set up."""
+        """Settings of the installation."""
         return replace(self.chosen, data=self.folder / "data")
 
     @cached_property
     def jobs(self) -> Jobs:
-        """The jobs, asked of the stores themselves."""
+        """The jobs, read directly from the stores."""
         return Jobs.open(self.settings)
 
     def client(self) -> Client:
-        """A client that waits for a service which is being started again."""
+        """Return a client that waits while the service restarts."""
         return Client(self.url, retries=PATIENT)
 
     def start(self) -> None:
-        """Start it; while the children of a killed one still hold the port or the directory, again, as a service manager does."""
+        """Start `pliant up`; retry while children of a killed instance still hold the port or the data directory."""
         command = [sys.executable, "-m", "pliant.cli", "up", "--json", "--port", str(self.port)]
         command += ["--data", str(self.folder / "data"), "--workers", str(self.workers)]
         environment = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
@@ -98,13 +98,13 @@ class Instance:
         raise AssertionError((self.folder / "log").read_text()[-3000:])
 
     def stop(self) -> None:
-        """SIGTERM to the supervisor, as a service manager or Ctrl-C does."""
+        """Send SIGTERM to the supervisor, as a service manager does, and wait for its end."""
         if self._process is not None:
             self._process.send_signal(signal.SIGTERM)
             self._end()
 
     def kill_all(self) -> None:
-        """Kill -9 to the supervisor; its children go with it."""
+        """Send SIGKILL to the supervisor, whose children end with it."""
         self.look()
         assert self._process is not None
         self._process.kill()
@@ -118,7 +118,7 @@ class Instance:
         self._process = None
 
     def look(self) -> dict[str, list[int]]:
-        """Return the processes by role, `job process` among them."""
+        """Return process ids by role, including `job process`."""
         assert self._process is not None
         found: dict[str, list[int]] = {role: [] for role in (*ROLES, "valkey", "job process")}
         for pid in children(self._process.pid):
@@ -134,7 +134,7 @@ class Instance:
         seen: list[int] = []
 
         def there() -> bool:
-            seen[:] = self.look()[role]  # one look: at the next one it may be gone
+            seen[:] = self.look()[role]  # look once: the process may end before a second look
             return bool(seen)
 
         self.until(there, f"there is a {role}")
@@ -143,7 +143,7 @@ class Instance:
         return pid
 
     def until(self, holds: Callable[[], object], what: str, *, seconds: float = 60.0) -> float:
-        """Wait for something, a store that is away counting as not yet; return how long it took."""
+        """Wait until `holds()` is true, retrying while a store is unavailable; return the seconds taken."""
         began = time.monotonic()
         while True:
             try:
@@ -155,7 +155,7 @@ class Instance:
             time.sleep(0.01)
 
     def midst(self, id: str, *stages: str, seconds: float = 60.0) -> str:
-        """Wait until a job is in one of these stages, or over; return its stage or status."""
+        """Wait until a job is in one of these stages or has ended; return its stage or status."""
 
         def there() -> bool:
             job = self.jobs.get(id)
@@ -166,12 +166,12 @@ class Instance:
         return job.progress.stage if job.progress is not None and not job.status.final else job.status.value
 
     def final(self, id: str, *, seconds: float = 120.0) -> Job:
-        """Wait for a job's end."""
+        """Wait until a job ends; return it."""
         self.until(lambda: self.jobs.get(id).status.final, f"job {id} ends", seconds=seconds)
         return self.jobs.get(id)
 
     def misfits(self, *, seconds: float = 60.0) -> list[str]:
-        """Say what was lost, doubled, half-written or left over, once everything has had time to settle."""
+        """Return what is lost, duplicated, half-written or left over, after up to `seconds` for cleaning up."""
         deadline = time.monotonic() + seconds
         while True:
             found = self._misfits()
@@ -203,7 +203,7 @@ class Instance:
 
 
 def children(parent: int) -> list[int]:
-    """Return the ids of the child processes that are not zombies."""
+    """Return the ids of child processes that are not zombies."""
     found: list[int] = []
     with suppress(OSError):  # it has ended
         for task in Path(f"/proc/{parent}/task").iterdir():
@@ -212,13 +212,13 @@ def children(parent: int) -> list[int]:
 
 
 def running(pid: int) -> bool:
-    """Tell whether a process is there and no zombie."""
+    """Return whether a process exists and is not a zombie."""
     state = _state(pid)
     return state is not None and state[0] != "Z"
 
 
 def resident(pid: int) -> int:
-    """Return the bytes of memory that a process has to itself or shares."""
+    """Return the resident memory of a process in bytes, shared pages included."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 

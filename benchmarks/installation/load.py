@@ -1,8 +1,9 @@
-"""Load: many small jobs, many pollers, one large upload, on a real installation of two workers.
+"""Load tests on a real installation with two workers: many small jobs, many pollers, one large upload.
 
     python -m benchmarks.installation.load [jobs] [pollers] [upload]
 
-Prints a table for each. Exits with 1 if a request was lost: one that got no answer, or another than it should.
+Prints a table for each. Exits with 1 if a request got no response or the wrong one, if the upload raised the API's memory by over 100 MB,
+or if the stores are inconsistent.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ MB = 2**20
 
 
 def percentiles(seconds: list[float]) -> str:
-    """Return median, 99th percentile and largest in milliseconds."""
+    """Return median, 99th percentile and maximum in milliseconds, as text."""
     p50, p99 = np.percentile(seconds, [50, 99])
     return f"{1000 * p50:.0f} / {1000 * p99:.0f} / {1000 * max(seconds):.0f}"
 
 
 @contextmanager
 def watched(pid: int) -> Iterator[Callable[[], float]]:
-    """Sample a process's memory; the function gives the largest so far, in MB."""
+    """Sample a process's memory; yield a function that returns the maximum so far, in MB."""
     largest, ended = [resident(pid)], Event()
 
     def sample() -> None:
@@ -55,8 +56,8 @@ def watched(pid: int) -> Iterator[Callable[[], float]]:
 
 
 def jobs(instance: Instance, *, number: int, clients: int) -> int:
-    """Let clients submit small jobs and wait for each, while one more reads the status of a job without pause."""
-    sequence = face(20, 200)  # with its cameras: what is measured is the way of a job, not the solver
+    """Submit small jobs from many clients and wait for each, while another client polls a job's status; return the number lost."""
+    sequence = face(20, 200)  # cameras are given: this measures the handling of jobs, not the solver
     submits: list[float] = []
     reads: list[float] = []
     ends: list[Status] = []
@@ -104,7 +105,7 @@ def jobs(instance: Instance, *, number: int, clients: int) -> int:
 
 
 class Poller:
-    """One connection that is kept, and nothing else: a thousand in one pool of httpx cost more than the service does."""
+    """One persistent connection: a thousand in one httpx pool would cost more than the service."""
 
     def __init__(self, url: str) -> None:
         self._host, port = url.removeprefix("http://").split(":")
@@ -112,7 +113,7 @@ class Poller:
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     async def get(self, path: str, headers: dict[str, str]) -> int:
-        """Send a GET, read the answer, return its status."""
+        """Send a GET, read the response, return its status."""
         if self._streams is None:
             self._streams = await asyncio.open_connection(self._host, self._port)
         reader, writer = self._streams
@@ -123,13 +124,13 @@ class Poller:
         return int(head.split()[1])
 
     def close(self) -> None:
-        """Give the connection up."""
+        """Close the connection."""
         if self._streams is not None:
             self._streams[1].close()
 
 
 def pollers(instance: Instance, *, number: int, seconds: float, every: float) -> int:
-    """Let many clients look at jobs at their own pace, and then all wait for one job at once (`Prefer: wait`)."""
+    """Poll jobs from many clients, then let all wait for one job at once (`Prefer: wait`); return the number of lost requests."""
     ids = instance.acknowledged or [one_job(instance)]
     reads: list[float] = []
     lost: list[str] = []
@@ -179,7 +180,7 @@ def pollers(instance: Instance, *, number: int, seconds: float, every: float) ->
 
 
 def upload(instance: Instance, *, size: int) -> int:
-    """Send a large file with the SDK, and watch the memory of the API while it arrives and while a job is made of it."""
+    """Upload a large file with the SDK; return 1 if the API's memory grew by over 100 MB until the job was accepted."""
     frames, points = 100, size * MB // (100 * 2 * 8)
     tracks = np.random.default_rng(0).normal(size=(frames, points, 2))
     assert tracks.nbytes > RESUMABLE_BYTES
@@ -221,7 +222,7 @@ def upload(instance: Instance, *, size: int) -> int:
 
 @contextmanager
 def _children_of(pid: int, largest: list[float]) -> Iterator[None]:
-    """Note how large the children of a process become, in MB."""
+    """Record the memory of a process's children, in MB."""
     ended = Event()
 
     def sample() -> None:
@@ -258,7 +259,7 @@ def one_job(
 
 
 def main() -> int:
-    """Run the loads that are asked for; return the exit code."""
+    """Run the selected loads; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("loads", nargs="*", default=["jobs", "pollers", "upload"], help="jobs, pollers, upload")
     parser.add_argument("--jobs", type=int, default=200)

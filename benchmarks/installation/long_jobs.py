@@ -1,9 +1,8 @@
-"""A job that is long on any machine: what is killed, cancelled or frozen in mid solve must not be done before that.
+"""A job that is long on any machine, so that it cannot finish before a fault hits it.
 
-Long by construction, not by size. The scale below which the loss is quadratic is so small that the weights of neighbouring
-reweightings differ by orders of magnitude, so the energy goes on falling through all the reweightings that may be; the low-rank
-prior keeps each one's inner solve at its upper bound of iterations; and the tolerance ends it only if nothing falls at all. The
-cameras are given, so that the reweighting begins at once.
+It is long by construction, not by size. The scale below which the loss is quadratic is so small that weights change by orders of magnitude
+between reweightings, so the energy keeps falling until the last of them; the low-rank prior keeps each inner solve at its maximum number of
+iterations; and the tolerance ends the solve only if nothing falls at all. Cameras are given, so that reweighting starts at once.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ LONG: dict[str, object] = {
     "robust_scale": 1e-9,
     "refine_rotations": False,
 }
-"""Options of a long job. Give it the tracks and rotations of `long_sequence`, and no mesh."""
+"""Options of a long job; submit them with the tracks and rotations of `long_sequence` and no mesh."""
 
 
 def long_sequence() -> Sequence:
-    """Return what a long job is given: few enough points for the first reweighting to be done soon, on a busy machine, too."""
+    """Return the sequence of a long job, small enough that its first reweighting ends soon even on a busy machine."""
     return face(60, 1500)

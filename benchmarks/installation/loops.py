@@ -1,6 +1,6 @@
-"""The loads on asyncio with h11 and on uvloop with httptools, side by side: `python -m benchmarks.installation.loops`.
+"""Compare the loads on asyncio with h11 and on uvloop with httptools: `python -m benchmarks.installation.loops`.
 
-The first installation cannot import uvloop and httptools, so uvicorn falls back, as where they are not installed.
+The first installation cannot import uvloop and httptools, so uvicorn falls back as if they were not installed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Load = Callable[[Instance], int]
 
 
 def without_extensions(folder: Path) -> dict[str, str]:
-    """Return variables of a process that can import neither uvloop nor httptools."""
+    """Return environment variables with which a process can import neither uvloop nor httptools."""
     folder.mkdir()
     for name in ("uvloop", "httptools"):
         (folder / f"{name}.py").write_text("raise ImportError('left out by the benchmark')\n")
@@ -31,7 +31,7 @@ def without_extensions(folder: Path) -> dict[str, str]:
 
 
 def rows_of(instance: Instance, load: Load) -> tuple[list[tuple[str, str]], int]:
-    """Run a load; return the rows that it prints and what it lost."""
+    """Run a load; return the rows that it prints and the number of lost requests."""
     printed = io.StringIO()
     with redirect_stdout(printed):
         lost = load(instance)
@@ -61,7 +61,7 @@ def main() -> int:
                 (first, lost_before), (second, lost_after) = rows_of(before, load), rows_of(after, load)
                 wrong += lost_before + lost_after
                 for (name, value), (_, other) in zip(first, second, strict=True):
-                    name = re.sub(r" \(\d+\)", "", name)  # how many status reads there were differs
+                    name = re.sub(r" \(\d+\)", "", name)  # the number of status reads differs
                     print(f"| {name} | {value} | {other} |" if value else f"| **{name}** | | |", flush=True)
             misfits = before.misfits() + after.misfits()
     print("fsck: " + (" ".join(misfits) or "the stores are consistent with the job records"))

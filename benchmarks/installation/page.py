@@ -1,4 +1,4 @@
-"""The page on a real service: time from `pliant up` to the first playing mesh, and the pictures in docs/images.
+"""The web page on a real service: time from `pliant up` to the first playing mesh, and the pictures in docs/images.
 
     python -m benchmarks.installation.page                      # times, as JSON
     python -m benchmarks.installation.page --film               # from a film dropped onto the page to its playing mesh
@@ -61,7 +61,7 @@ def frame(page: Page) -> float:
 
 
 def play_example(page: Page) -> None:
-    """Click once, wait until the mesh moves."""
+    """Start the built-in example and wait until its mesh moves."""
     page.get_by_role("button", name="Try it with a synthetic face").click()
     page.locator(".view canvas").wait_for(timeout=300_000)
     while frame(page) == 0:
@@ -69,7 +69,7 @@ def play_example(page: Page) -> None:
 
 
 def first_mesh() -> dict[str, float]:
-    """Seconds from the start of `pliant up` until it is ready, the page stands, and the built-in example plays."""
+    """Return the seconds from starting `pliant up` until it is ready, the page is shown, and the built-in example plays."""
     began = time.perf_counter()
     with service() as url, Browsing() as browser:
         ready = time.perf_counter() - began
@@ -95,10 +95,10 @@ DROP = """([name, data]) => {
 
 
 def dropped_film() -> dict[str, Any]:
-    """Seconds from dropping the example film onto the page until its first frame shows, its tracks are done, and its mesh plays."""
+    """Return the seconds from dropping the example film until its first frame shows, each stage begins, and its mesh plays."""
     with service() as url, Browsing() as browser:
         example = next(one for one in httpx.get(f"{url}/v1/examples").json()["examples"] if one["region_polygon"])
-        film = httpx.get(f"{url}{example['files'][0]['url']}", timeout=120).content  # made when first asked for
+        film = httpx.get(f"{url}{example['files'][0]['url']}", timeout=120).content  # rendered on the first request
         page = browser.new_page(viewport={"width": 1280, "height": 900})
         page.goto(url)
         page.get_by_text("Drop a film here").wait_for()
@@ -130,7 +130,7 @@ def _stages(url: str, began: float) -> dict[str, float]:
 
 
 def talking_face(url: str) -> str:
-    """Have a face reconstructed; return the job's id. Clean tracks, so the closed form in time does: it takes seconds."""
+    """Reconstruct a face; return the job's id. The tracks are clean, so the closed-form `temporal` method suffices and takes seconds."""
     sequence = face(40, 5000, degrees=50)
     client = Client(url)
     job = client.submit(
@@ -145,7 +145,7 @@ def talking_face(url: str) -> str:
 
 
 def pictures(folder: Path) -> None:
-    """Take the page at 1280 and 390 pixels, light and dark."""
+    """Take pictures of the page at widths of 1280 and 390 pixels, light and dark."""
     folder.mkdir(parents=True, exist_ok=True)
     with service() as url, Browsing() as browser:
         address = f"{url}/#job={talking_face(url)}"
@@ -174,7 +174,7 @@ def pictures(folder: Path) -> None:
 
 
 def save(png: bytes, path: Path) -> None:
-    """Write a picture, with a palette of its own where all its colours would take too many bytes."""
+    """Write a picture, reduced to 256 colours if it exceeds `MOST_BYTES`."""
     from PIL import Image
 
     picture = Image.open(io.BytesIO(png)).convert("RGB")

@@ -1,12 +1,12 @@
-"""Seconds left, as shown while a job runs, against the true ones: thirteen runs over HTTP and on the command line.
+"""Compare displayed with true remaining time in thirteen runs, over HTTP and on the command line.
 
     python -m benchmarks.installation.progress --results benchmarks/results/progress.jsonl
     python -m benchmarks.installation.progress --only flag,sphere
 
-Each run writes one line: the ticks as [seconds since the start, seconds left as shown], the longest time without a tick, the first tick
-after a quarter of the way, and the share of the ticks from there on that are within a factor of two of the true time: of those with 2 s or
-more left (`doubled`), and of all, with 2 s of slack (`within`). Over HTTP the ticks are the events that the page follows; on the command
-line they are what `pliant solve` writes on a terminal.
+Each run appends one line: the ticks as [seconds since the start, displayed seconds left], the longest time without a tick, the first tick
+after a quarter of the run, and the share of ticks from there on within a factor of two of the true time, among those with 2 s or more left
+(`doubled`) and among all, with 2 s of slack (`within`). Over HTTP, ticks are the events that the page follows; on the command line, the
+updates that `pliant solve` writes to a terminal.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from benchmarks.rows import append_row
 
 SHOWN = re.compile(rb"(\d+) s left")
 SLACK = 2.0
-"""Seconds by which a shown time may be off without counting as wrong: it is shown in whole seconds, and a message takes up to one."""
+"""Tolerated error of a displayed time, s: it is shown in whole seconds, and a message takes up to one."""
 TICKS = 80
-"""Ticks that a line keeps, evenly spaced."""
+"""Number of ticks stored per run, evenly spaced."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Run:
     cameras: bool = False
     """Whether the true rotations are given."""
     film: bool = False
-    """Whether a rendered film is sent in place of tracks and mesh."""
+    """Whether a rendered film is sent instead of tracks and mesh."""
 
 
 RUNS = (
@@ -70,7 +70,7 @@ RUNS = (
 
 
 def main() -> None:
-    """Run, print a table, and append a line a run."""
+    """Run all, print a table, and append one line per run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="names or parts of them, separated by commas")
     parser.add_argument("--results", type=Path, help="JSON lines to append to")
@@ -96,7 +96,7 @@ def main() -> None:
 
 
 def measured(run: Run, scratch: Path, instance: Instance) -> dict[str, Any]:
-    """Run once."""
+    """Run once and return the row."""
     sequence = run.make()
     files = {"tracks": scratch / "tracks.npz", "mesh": scratch / "mesh.npz"}
     np.savez(files["tracks"], tracks=sequence.tracks.points, visibility=sequence.tracks.visible > 0)
@@ -131,7 +131,7 @@ def measured(run: Run, scratch: Path, instance: Instance) -> dict[str, Any]:
 def over_http(
     files: dict[str, Path], options: dict[str, str], instance: Instance
 ) -> Iterator[tuple[float, float | None]]:
-    """Yield time and seconds left of every event since the job runs; the last one is the end."""
+    """Yield time and displayed seconds left for every event once the job runs; the last item is the end."""
     with Client(instance.url) as client:
         job = client.submit(**files, options=options)
         instance.acknowledged.append(job.id)
@@ -147,7 +147,7 @@ def over_http(
 def on_the_command_line(
     files: dict[str, Path], options: dict[str, str], scratch: Path
 ) -> Iterator[tuple[float, float | None]]:
-    """Yield time and seconds left of everything that `pliant solve` writes on a terminal; the last one is the end."""
+    """Yield time and displayed seconds left for every update that `pliant solve` writes; the last item is the end."""
     command = [sys.executable, "-m", "pliant.cli", "solve", str(files["tracks"]), "-o", str(scratch / "out"), "--force"]
     command += [f"--{name}={path}" for name, path in files.items() if name != "tracks"]
     for name, value in options.items():

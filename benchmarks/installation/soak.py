@@ -1,9 +1,9 @@
-"""Soak: jobs come without pause while processes are killed at random; nothing acknowledged may be lost.
+"""Soak test: submit jobs continuously and kill processes at random; no acknowledged job may be lost.
 
     python -m benchmarks.installation.soak --minutes 15
 
-Prints a table of the faults, what the records said of the jobs that were hit, after how many seconds, and what was lost.
-Exits with 1 if anything was.
+Prints a table of the faults with the outcomes of the jobs that were hit and the seconds until they ended, and lists what was lost. Exits
+with 1 on any loss.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ FAULTS = (
     "cancel",
 )
 OUTAGE = "Valkey hangs for 30 s"
-"""Comes by the clock, every five minutes, since it takes so long."""
+"""Injected every five minutes instead of at random, because it takes so long."""
 OUTAGE_EVERY = 300.0
 
 ALLOWED = {"kill job process": Status.FAILED, "cancel": Status.CANCELLED}
-"""How a job may end, besides succeeding, that a fault hit."""
+"""Final status, besides succeeded, that a fault may cause."""
 
 IN_HAND = 6
-"""Jobs that are unfinished at any time."""
+"""Number of unfinished jobs at any time."""
 
 
 @dataclass
@@ -60,9 +60,9 @@ class Soak:
     inputs: Path
     random: random.Random
     open: dict[str, float] = field(default_factory=dict)
-    """Unfinished jobs: when each was acknowledged."""
+    """Time of acknowledgement of each unfinished job."""
     hit: dict[str, list[tuple[str, float]]] = field(default_factory=lambda: defaultdict(list))
-    """Unfinished jobs that faults hit: which, and when."""
+    """Faults that hit each unfinished job, and when."""
     outcomes: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     ends: Counter[str] = field(default_factory=Counter)
@@ -71,7 +71,7 @@ class Soak:
     feeding: bool = True
 
     def submit(self) -> None:
-        """Submit one job; a store that is just being restarted refuses, which is no loss."""
+        """Submit one job; a submission refused while a store restarts is not a loss."""
         interpretation = Interpretation(
             num_frames=0, num_points=0, num_faces=0, hidden_fraction=0, mesh_source="given", has_ground_truth=False,
             has_rotations=False, layout="",
@@ -85,7 +85,7 @@ class Soak:
             self.open[job.id] = time.monotonic()
 
     def collect(self) -> None:
-        """Take note of the jobs that have ended, and of what they say."""
+        """Record the outcomes of jobs that have ended."""
         for id in list(self.open):
             job = self.jobs.get(id)
             if job.status.final:
@@ -105,7 +105,7 @@ class Soak:
             self.wrong.append(f"job {job.id} is {job.status.value}{code} after {[fault for fault, _ in hits]}")
 
     def strike(self, fault: str) -> None:
-        """Commit one fault."""
+        """Inject one fault."""
         pids = self.supervisor.pids()
         workers = [pid for name, pid in pids.items() if name.startswith("worker")]
         now = time.monotonic()
@@ -139,7 +139,7 @@ class Soak:
             _send(victim, signal.SIGTERM if fault == "SIGTERM worker" else signal.SIGKILL)
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """Keep everything running for a while; tell whether `until` came true."""
+        """Supervise processes, collect and submit jobs for a while; return whether `until` became true."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             self.supervisor.look()
@@ -186,7 +186,7 @@ def main() -> int:
 
 
 def run(soak: Soak, seconds: float, every: float) -> int:
-    """Strike at random, then let everything end; report."""
+    """Inject faults at random, wait until all jobs end, and print the report; return the exit code."""
     began, faults = time.monotonic(), Counter[str]()
     outage = began + OUTAGE_EVERY / 2
     while time.monotonic() < began + seconds:
@@ -202,7 +202,7 @@ def run(soak: Soak, seconds: float, every: float) -> int:
     soak.feeding = False
     ended = soak.wait(120.0, until=lambda: not soak.open)
     soak.wrong += [] if ended else [f"job {id} has not ended" for id in soak.open]
-    soak.wait(100.0, until=lambda: not findings(soak.jobs, pause=0.5))  # the reconciler tidies up every half minute
+    soak.wait(100.0, until=lambda: not findings(soak.jobs, pause=0.5))  # the reconciler cleans up every half minute
     soak.wrong += findings(soak.jobs)
     print(f"{sum(soak.ends.values())} jobs acknowledged in {seconds / 60:g} min, {sum(faults.values())} faults")
     print(f"{soak.refused} submissions refused while Valkey was being started again (never acknowledged)\n")

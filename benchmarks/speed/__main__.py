@@ -1,4 +1,4 @@
-r"""Time and memory: side by side with what else there is, and against the size.
+r"""Measure time and memory, beside baselines and against the size.
 
     python -m benchmarks.speed compare --data DIR --only facescan99   the solver and the baselines on one energy
     python -m benchmarks.speed growth                                 against P and against F, with fitted exponents
@@ -6,12 +6,12 @@ r"""Time and memory: side by side with what else there is, and against the size.
         --against-points "" --against-frames 300,1000,3000,10000 --results benchmarks/results/growth.jsonl
     python -m benchmarks.speed mesh --frames 30 --points 10000        a mesh and a grid of equal F and P
 
-Without `--data` the sequence is a gallery face. Every number comes from a process of its own. Wall time is what counts on a quiet
-machine; CPU time of all threads stands beside it because it stays comparable where other work shares the cores.
+Without `--data` the sequence is synthetic (`--kind`). Each number comes from a separate process. Wall time counts on an idle machine; CPU
+time of all threads is listed too, because it stays comparable when other work shares the cores.
 
-`compare`: every baseline is given the normalised problem and the final translations, which are not charged to it, begins at the
-pseudo-inverse (`--start ours`: at the solver's own start, as free of charge), and runs until it is within 1 % of the solver's last
-energy or `--cap` seconds have gone; then its time is extrapolated at its last rate, and the table says so.
+`compare`: every baseline gets the normalised problem and the final translations free of charge, starts from the pseudo-inverse (with
+`--start ours` from the solver's own start, also free of charge), and runs until it is within 1 % of the solver's final energy or `--cap`
+seconds have passed. In the latter case the table gives a time extrapolated from its last rate, and marks it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from benchmarks.speed.side_by_side import BASELINES, Workload, compare
 
 
 def main() -> None:
-    """Measure what is asked for."""
+    """Run the selected measurement."""
     options = _parser().parse_args()
     work = Workload(
         data=options.data, only=options.only, kind=options.kind, frames=options.frames, points=options.points, outliers=options.outliers,
@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def command_of(arguments: list[str]) -> str:
-    """Return the command that measures the same, without the place where its rows went."""
+    """Return the command that repeats the measurement, without `--results`."""
     kept = [each for each in arguments if not each.startswith("--results=")]
     if "--results" in kept:
         place = kept.index("--results")

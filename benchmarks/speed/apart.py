@@ -1,4 +1,4 @@
-"""One measurement in a process of its own: its peak memory is its own, and running out of memory ends nothing else."""
+"""Run a measurement in a separate process, so that its peak memory is its own and running out of memory ends nothing else."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ STATUS = Path("/proc/self/status")
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What one process took."""
+    """Resources used by one process."""
 
     value: Any
     """What the function returned; None if it ran out of memory."""
 
     seconds: float
     cpu_seconds: float
-    """Of all its threads: what stays comparable when other work shares the machine."""
+    """CPU time of all threads, which stays comparable when other work shares the machine."""
 
     peak: int
     """Largest resident memory, bytes, libraries included."""
 
     growth: int
-    """How much of that came after `Stopwatch.start`."""
+    """Increase of the peak over the resident memory at `Stopwatch.start`, bytes."""
 
     load: float
-    """Mean number of processes that wanted to run, at the end; above the number of cores, wall time says little."""
+    """Load average at the end; above the number of cores, wall time means little."""
 
 
 class Stopwatch:
-    """Given to the function: what comes before `start` (reading, corrupting) does not count."""
+    """Passed to the measured function; work before `start` (reading, corrupting) does not count."""
 
     def __init__(self) -> None:
         self.start()
@@ -52,13 +52,15 @@ class Stopwatch:
 
 
 def memory(name: str) -> int:
-    """Return a line of Linux's account of this process in bytes: `VmRSS` now, `VmHWM` at most."""
+    """Return an entry of `/proc/self/status` in bytes: `VmRSS` (current) or `VmHWM` (peak)."""
     lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())
     return int(lines[name].split()[0]) * 1024
 
 
 def apart(work: Callable[..., Any], *arguments: Any, limit: int | None = None) -> Measured | None:
-    """Call `work(stopwatch, *arguments)`, importable by name, in a fresh process of `limit` bytes; None if they did not suffice."""
+    """Call `work(stopwatch, *arguments)`, importable by name, in a new process limited to `limit` bytes; return None if it runs out of
+    memory.
+    """
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         try:

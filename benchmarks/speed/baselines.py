@@ -1,7 +1,7 @@
-"""What a competent reader of the paper would write, minimising the very energy that the solver minimises.
+"""Baseline minimisers of the solver's energy, as a competent reader of the paper would write them.
 
-Each takes the problem as the solver built it (normalised tracks, cameras, weights λ, Laplacian) and shapes to start from, whose cost
-is not charged to it, and runs until the energy is at most `target`, or until its time is up:
+Each takes the problem as built by the solver (normalised tracks, cameras, weights λ, Laplacian) and initial shapes, whose cost is not
+counted, and runs until the energy is at most `target` or `cap` seconds have passed:
 
     gradient_descent       the paper's iteration: gradient of eq. 9, exact line search, new L1 weights in every iteration
     conjugate_gradients    SciPy's CG with a Jacobi preconditioner on the explicit sparse normal equations, inside the
@@ -35,7 +35,7 @@ class Run:
     reached: bool = False
 
     def note(self, began: float, value: float, target: float) -> bool:
-        """Add a point; returns whether the target is reached."""
+        """Append a sample; return whether the target is reached."""
         self.seconds.append(time.perf_counter() - began)
         self.objective.append(value)
         self.reached = value <= target
@@ -47,8 +47,8 @@ def gradient_descent(
 ) -> Run:
     """Steepest descent with exact line search on the reweighted energy.
 
-    Vectorised over everything. The smoothness part of the gradient is linear, so its value at the new shapes comes from its
-    value along the step: one sparse product an iteration instead of two.
+    Fully vectorised. The smoothness part of the gradient is linear, so its value at the new shapes follows from its value along the step:
+    one sparse product per iteration instead of two.
     """
     run, began = Run(), time.perf_counter()
     smooth = _smoothness_gradient(problem)
@@ -89,7 +89,7 @@ def direct(problem: Problem, shapes: np.ndarray, translations: np.ndarray, *, ta
         run.iterations += 1
         try:
             factor = splu((fixed + data).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        except SystemError as error:  # what SuperLU says when it cannot have the memory
+        except SystemError as error:  # SuperLU's error when memory runs out
             raise MemoryError("the sparse factor does not fit") from error
         return factor.solve(right)
 
@@ -111,7 +111,7 @@ def normal_matrix(problem: Problem) -> sparse.csr_array:
 
 
 def _repeated(block: sparse.csr_array, times: int) -> sparse.csr_array:
-    """Return I ⊗ block; what `sparse.kron` gives, without its detour over coordinates, which needs several times the memory."""
+    """Return I ⊗ block, as `sparse.kron` but without its coordinate-format intermediate, which needs several times the memory."""
     size, entries = block.shape[0], block.nnz
     kind = np.int32 if times * max(entries, size) < 2**31 else np.int64
     shift = np.arange(times, dtype=kind)[:, None]
@@ -158,7 +158,7 @@ def _scipy_cg(reduction: float, cap: float) -> Inner:
     ) -> np.ndarray:
         diagonal = fixed.diagonal() + data.diagonal()
         size = len(right)
-        # Two products instead of one with the sum: assembling the sum anew costs more than it saves.
+        # Two products instead of one: assembling the sum for each reweighting costs more than it saves.
         matrix = LinearOperator((size, size), matvec=lambda x: fixed @ x + data @ x, dtype=right.dtype)
         jacobi = LinearOperator((size, size), matvec=lambda x: x / diagonal, dtype=right.dtype)
         enough = reduction * float(np.linalg.norm(right - matrix @ start))
@@ -171,7 +171,7 @@ def _scipy_cg(reduction: float, cap: float) -> Inner:
             if time.perf_counter() - began > cap:
                 raise TimeoutError
 
-        with contextlib.suppress(TimeoutError):  # the last iterate stands, and the run ends
+        with contextlib.suppress(TimeoutError):  # keep the last iterate and end the run
             latest, _ = cg(matrix, right, x0=start, rtol=0.0, atol=enough, maxiter=2000, M=jacobi, callback=count)
         return latest
 

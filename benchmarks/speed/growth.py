@@ -13,15 +13,15 @@ from benchmarks.speed.apart import Measured, apart
 from benchmarks.speed.side_by_side import Ours, Workload, run_ours
 
 POINTS = (5_000, 10_000, 30_000, 100_000, 300_000)
-"""At `FIXED_FRAMES` frames."""
+"""Numbers of points at `FIXED_FRAMES` frames."""
 FRAMES = (10, 25, 50, 100, 200, 400, 800)
-"""At `FIXED_POINTS` points."""
+"""Numbers of frames at `FIXED_POINTS` points."""
 FIXED_FRAMES, FIXED_POINTS = 10, 2_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sizes:
-    """What is measured; an empty series is left out."""
+    """Sizes to measure; an empty series is skipped."""
 
     points: tuple[int, ...] = POINTS
     frames: tuple[int, ...] = FRAMES
@@ -40,9 +40,9 @@ class Sizes:
 
 
 def growth(work: Workload, sizes: Sizes | None = None, *, results: Path | None = None, command: str = "") -> list[str]:
-    """Measure; returns the lines of two Markdown tables with the fitted exponents.
+    """Measure; return the lines of the Markdown tables with the fitted exponents.
 
-    With `results` every measurement is appended to a file of JSON lines as soon as it is there, with `command`.
+    Each measurement is appended to the JSON-lines file `results`, if given, with `command`.
     """
     lines: list[str] = []
     sizes = Sizes() if sizes is None else sizes
@@ -91,7 +91,7 @@ def _append(results: Path, record: dict[str, object]) -> None:
 
 
 def best_of(work: Workload, *, repeats: int = 3, enough: float = 10.0) -> Measured:
-    """Measure up to three times, or until it has taken 10 s; the quickest is the least disturbed."""
+    """Measure up to `repeats` times, or until `enough` seconds have passed; return the run with the least CPU time."""
     taken: list[Measured] = []
     while len(taken) < repeats and sum(each.seconds for each in taken) < enough:
         measured = apart(run_ours, work)
@@ -112,7 +112,7 @@ def _series(done: list[Measured]) -> dict[str, list[float]]:
 
 
 def per_iteration(ours: Ours) -> float:
-    """Seconds of the shape step for each iteration of conjugate gradients, reweighting included."""
+    """Return the seconds of the shape step per iteration of conjugate gradients, reweighting included."""
     return ours.stages["shapes"] / max(ours.iterations, 1)
 
 
@@ -127,7 +127,7 @@ def _row(measured: Measured) -> str:
 
 
 def mesh_against_grid(work: Workload) -> list[str]:
-    """Measure a triangle mesh and a grid of equal F and P."""
+    """Compare a triangle mesh with a grid of equal F and P."""
     lines: list[str] = []
     _say(
         lines, "| neighbours | cameras | shapes (CPU, whole) | iterations | an iteration | peak memory | bytes a F·P |"
@@ -144,7 +144,7 @@ def mesh_against_grid(work: Workload) -> list[str]:
 
 
 def exponent(sizes: np.ndarray, seconds: np.ndarray) -> float:
-    """Slope of log time over log size."""
+    """Return the slope of log time over log size."""
     return float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
 
 

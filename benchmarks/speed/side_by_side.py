@@ -1,4 +1,4 @@
-"""The solver beside what a competent reader of the paper would write, on one energy."""
+"""Compare the solver with baseline minimisers on one energy."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from benchmarks.speed import baselines
 from benchmarks.speed.apart import Measured, Stopwatch, apart
 
 GAP = 1.01
-"""A baseline is done when its energy is within 1 % of the solver's last."""
+"""Energy, relative to the solver's final one, at which a baseline is done: within 1 %."""
 
 MOST_COMPARED = 20_000_000
-"""Number of observations of which an error is computed, which takes some 150 bytes for each."""
+"""Maximum number of observations in the error, which takes about 150 bytes for each."""
 
 BASELINES = ("conjugate_gradients", "gradient_descent", "direct")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Workload:
-    """A sequence with outliers, by name, so that every process can make it anew."""
+    """A corrupted sequence by name, so that each process can rebuild it."""
 
     data: Path | None = None
     only: str = "face"
     kind: str = "face"
-    """Of the gallery: face, flag, sphere or talk."""
+    """Gallery sequence: face, flag, sphere or talk."""
     frames: int = 20
     points: int | None = None
     outliers: float = 0.10
     noise: float = 0.0
     mesh: str = "grid"
     known: bool = True
-    """True cameras are given: the shapes alone are measured."""
+    """Whether true cameras are given, so that only the shapes are measured."""
     settings: str = "prior=smooth"
     start: str = "tracks"
-    """What the baselines begin with: `tracks`, the pseudo-inverse R†(W − t), or `ours`, the solver's own start."""
+    """Start of the baselines: `tracks`, the pseudo-inverse R†(W − t), or `ours`, the solver's own start."""
     scratch: Path | None = None
-    """Folder for the temporary file that holds the result of a large solve; None holds it in memory."""
+    """Folder for the temporary file that holds the result of a large solve; None keeps it in memory."""
 
     def case(self) -> Case:
-        """Read the sequence, or make a gallery face, and spoil it."""
+        """Read or generate the sequence, and corrupt it."""
         if self.data is None:
             make = getattr(gallery, self.kind)
             options = {} if self.kind == "sphere" else {"mesh": self.mesh}
@@ -70,26 +70,26 @@ class Workload:
 
 @dataclass(frozen=True, slots=True)
 class Ours:
-    """What the solver did."""
+    """Measurements of one solve."""
 
     reached: tuple[float, float]
-    """Wall and CPU seconds after which its energy was within 1 % of its last, everything included."""
+    """Wall and CPU seconds until the energy was within 1 % of its final value, everything included."""
     started: tuple[float, float]
-    """Of these, what had gone before the start that the baselines are given: normalising, cameras, weights, the start itself."""
+    """Part of `reached` before the baselines' start: normalisation, cameras, weights, and the start itself."""
     objective: float
     translations: np.ndarray
-    """Final, normalised units; the baselines are given them."""
+    """Final translations in normalised units, which the baselines are given."""
     iterations: int
     reweightings: int
     stages: dict[str, float]
     error: float | None
     size: tuple[int, int]
     silence: float
-    """Longest time between two reports of progress."""
+    """Longest time between two progress reports, s."""
 
 
 def run_ours(watch: Stopwatch, work: Workload) -> Ours:
-    """Solve, after a tiny solve that loads what is loaded once."""
+    """Solve, after a tiny solve that does the one-time imports."""
     solved(Workload(frames=4, points=50, settings=work.settings))
     case, history = work.case(), []
     normalized = normalize(case.tracks)
@@ -112,7 +112,7 @@ def run_ours(watch: Stopwatch, work: Workload) -> Ours:
 
 
 def _error(solution: Solution, case: Case) -> float | None:
-    """Return the error, of evenly spread points where there are more observations than `MOST_COMPARED`."""
+    """Return `e3d_frame`, on evenly spread points if there are more than `MOST_COMPARED` observations."""
     if case.shapes is None:
         return None
     every = -(-case.shapes[..., 0].size // MOST_COMPARED)
@@ -120,7 +120,7 @@ def _error(solution: Solution, case: Case) -> float | None:
 
 
 def run_baseline(watch: Stopwatch, work: Workload, name: str, ours: Ours, cap: float) -> baselines.Run:
-    """Run one baseline until it is within 1 % of the solver's energy, or `cap` seconds have gone."""
+    """Run one baseline until it is within 1 % of the solver's energy or `cap` seconds have passed."""
     case = work.case()
     assert case.cameras is not None
     problem, start = prepare(case.tracks, case.mesh, case.cameras, work.chosen())
@@ -134,7 +134,7 @@ def run_baseline(watch: Stopwatch, work: Workload, name: str, ours: Ours, cap: f
 
 
 def prepare(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera, settings: Settings) -> tuple[Problem, np.ndarray]:
-    """Build the solver's problem and its start, normalised units."""
+    """Build the solver's problem and its start, in normalised units."""
     still = np.zeros((tracks.num_frames, 2))
     scales = np.ones(tracks.num_frames) if cameras.scales is None else cameras.scales
     estimate = CameraEstimate(cameras.rotations, scales, still, 0, np.zeros((0, 0)), np.zeros((len(scales), 0, 2)))
@@ -143,7 +143,7 @@ def prepare(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera, settings: S
 
 
 def compare(work: Workload, *, names: list[str], cap: float, limit: int) -> list[str]:
-    """Measure the solver and every baseline; returns the lines of a Markdown table."""
+    """Measure the solver and every baseline; return the lines of a Markdown table."""
     measured = apart(run_ours, work)
     assert measured is not None, "the solver ran out of memory"
     ours: Ours = measured.value
@@ -191,16 +191,16 @@ def _line(name: str, done: Measured | None, ours: Ours, limit: int) -> str:
 
 
 def from_start(ours: Ours) -> tuple[float, float]:
-    """Wall and CPU seconds from the start that the baselines are given to within 1 %."""
+    """Return wall and CPU seconds from the baselines' start to within 1 % of the final energy."""
     wall, cpu = (max(end - begin, 1e-3) for end, begin in zip(ours.reached, ours.started, strict=True))
     return wall, cpu
 
 
 def extrapolated(run: baselines.Run, *, best: float) -> float:
-    """Seconds at which the run would have been within 1 % of `best`, had it gone on at the rate of its last half.
+    """Extrapolate the seconds until a run is within 1 % of `best` from the rate of its last half.
 
-    The gap to the best energy falls geometrically at the end of a descent, and slower and slower before: the estimate errs low.
-    Infinite if the gap does not fall.
+    The gap to the best energy falls ever more slowly, and geometrically at the end of a descent, so the estimate errs low. Infinite if the
+    gap does not fall.
     """
     seconds, gap = np.array(run.seconds), np.array(run.objective) / best - 1
     late = seconds >= seconds[-1] / 2

@@ -23,7 +23,7 @@ ROOT = Path(__file__).parent.parent.parent
 
 @pytest.fixture
 def bench(monkeypatch):
-    """Import a module of the benchmarks as they import each other: from the root of the repository."""
+    """Return a function that imports a module of the benchmarks from the root of the repository, as they do."""
     monkeypatch.syspath_prepend(str(ROOT))
     return lambda name: import_module(f"benchmarks.{name}")
 
@@ -43,7 +43,7 @@ def write_case(folder: Path) -> None:
     (folder / "about.json").write_text(json.dumps({"units": "pixels"}))
 
 
-def test_accuracy_measures_once_and_resumes(tmp_path):
+def test_accuracy_runs_resume_without_remeasuring(tmp_path):
     write_case(tmp_path / "data" / "tiny")
     results = tmp_path / "cells.jsonl"
     arguments = ("--data", tmp_path / "data", "--points", 60, "--methods", "pseudo_inverse,temporal", "--corruptions",
@@ -71,7 +71,7 @@ def test_accuracy_measures_once_and_resumes(tmp_path):
     again = run(*arguments)
     assert again.returncode == 0, again.stderr
     lines = results.read_text().splitlines()
-    assert lines[:-2] == kept.splitlines()[:-1]  # nothing else was measured anew
+    assert lines[:-2] == kept.splitlines()[:-1]  # nothing else was remeasured
     remade, original = json.loads(lines[-1]), json.loads(kept.splitlines()[-1])
     assert remade["metrics"] == pytest.approx(original["metrics"])
 
@@ -210,7 +210,7 @@ def test_pictures_show_what_the_camera_saw(bench, y_up: bool) -> None:
 
 
 @pytest.mark.parametrize("given", ["mesh and truth", "tracks alone"])
-def test_pictures_are_drawn_of_anything(tmp_path: Path, given: str) -> None:
+def test_pictures_are_drawn_with_or_without_mesh_and_truth(tmp_path: Path, given: str) -> None:
     from PIL import Image
 
     write_case(tmp_path / "some")

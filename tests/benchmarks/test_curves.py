@@ -1,4 +1,4 @@
-"""Curves of error against spoiling: every draw once."""
+"""Error as a function of corruption: every draw is solved once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tracks seen by a pinhole at a distance, the errors of trackers, and the table of the choice of a camera model."""
+"""Tracks seen by a distant pinhole camera, simulated tracker errors, and the table of camera-model choices."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent.parent
 
 @pytest.fixture
 def bench(monkeypatch):
-    """Import a module of the benchmarks as they import each other: from the root of the repository."""
+    """Return a function that imports a module of the benchmarks from the root of the repository, as they do."""
     monkeypatch.syspath_prepend(str(ROOT))
     return lambda name: import_module(f"benchmarks.{name}")
 
@@ -25,7 +25,7 @@ def standing(frames: int = 60, points: int = 80) -> Tracks:
     return Tracks.from_arrays(np.tile(places, (frames, 1, 1)))
 
 
-def test_a_pinhole_at_a_distance_is_orthography_in_the_limit(bench) -> None:
+def test_a_distant_pinhole_camera_converges_to_orthography(bench) -> None:
     distances = bench("accuracy.distances")
     case = distances.cases(None, points=60, visibility="all", only=["sphere"])
     case = next(iter(case))
@@ -49,7 +49,7 @@ def test_drift_grows_like_a_random_walk_and_noise_does_not(bench) -> None:
     assert (spoiling.spoiled(tracks, spoiling.SPOILINGS["clean"]).points == tracks.points).all()
 
 
-def test_tracks_begin_and_end_anywhere_and_some_jump(bench) -> None:
+def test_simulated_tracks_are_partial_and_some_jump(bench) -> None:
     spoiling = bench("accuracy.spoiling")
     tracks = standing(points=2000)
     found = spoiling.spoiled(tracks, spoiling.SPOILINGS["births"])

@@ -1,4 +1,4 @@
-"""Other authors' methods: tracks and shapes through files, why a method gave none, and the table. A script stands for Octave."""
+"""Other authors' methods: exchange of tracks and shapes, reasons of failure, and the table. A script stands in for Octave."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ S = __import__("numpy").zeros((len(W) // 2 * 3, W.shape[1]))
 S[0::3], S[1::3], S[2::3] = W[0::2], W[1::2], {depth}
 savemat("shapes.mat", {{"S": S, "seconds": 1.25}})
 """
-"""Shapes of one depth, in Octave's place."""
+"""A stand-in for Octave that returns shapes of constant depth."""
 
 
 @pytest.fixture
 def bench(monkeypatch):
-    """Import a module of the benchmarks as they import each other: from the root of the repository."""
+    """Return a function that imports a module of the benchmarks from the root of the repository, as they do."""
     monkeypatch.syspath_prepend(str(ROOT))
     return lambda name: import_module(f"benchmarks.{name}")
 
 
 @pytest.fixture
 def octave(monkeypatch, tmp_path):
-    """Put a Python program in the place of `octave-cli`."""
+    """Replace `octave-cli` by a Python program."""
 
     def put(program: str) -> None:
         at = tmp_path / "bin" / "octave-cli"
@@ -47,7 +47,7 @@ def octave(monkeypatch, tmp_path):
 
 @pytest.fixture
 def data(tmp_path) -> Path:
-    """Two sequences, of which one has hidden points and no cameras."""
+    """Two sequences without cameras, one of them with a hidden point."""
     sequence = sphere(8, 30)
     for name, seen in (("seen", 1.0), ("hidden", 0.0)):
         folder = tmp_path / "data" / name
@@ -61,7 +61,7 @@ def data(tmp_path) -> Path:
 
 @pytest.fixture
 def code(tmp_path) -> Path:
-    """A folder with empty files of the authors' names."""
+    """A folder with empty files named like the authors' code."""
     for name in ("a/nrsfm_trajectory.m", "b/NRSFM_BMM.m", "c/install_sdpt3.m", "c/Solver/Mexfun/x.m", "c/.git/y.m"):
         at = tmp_path / "code" / name
         at.parent.mkdir(parents=True, exist_ok=True)
@@ -69,7 +69,7 @@ def code(tmp_path) -> Path:
     return tmp_path / "code"
 
 
-def test_tracks_go_to_octave_and_shapes_come_back(bench, octave) -> None:
+def test_octave_receives_tracks_and_returns_shapes(bench, octave) -> None:
     octave(FLAT.format(depth=7))
     tracks = np.random.default_rng(0).normal(size=(5, 4, 2))
     shapes, seconds = bench("accuracy.octave").run("S = f (W);", tracks, paths=[], seconds=60)
@@ -79,7 +79,7 @@ def test_tracks_go_to_octave_and_shapes_come_back(bench, octave) -> None:
     assert seconds == 1.25
 
 
-def test_octave_gets_the_call_and_the_folders(bench, octave, tmp_path) -> None:
+def test_the_octave_script_adds_the_paths_before_the_call(bench, octave, tmp_path) -> None:
     octave(f'import shutil; shutil.copytree(".", "{tmp_path}/seen")')
     with pytest.raises(bench("accuracy.octave").Failed):
         bench("accuracy.octave").run("S = f (W, 3);", np.ones((2, 3, 2)), paths=[Path("/first")], seconds=60)
@@ -97,13 +97,13 @@ def test_octave_gets_the_call_and_the_folders(bench, octave, tmp_path) -> None:
         (FLAT.format(depth="float('nan')"), "not finite"),
     ],
 )
-def test_a_failure_says_why(bench, octave, program: str, reason: str) -> None:
+def test_a_failed_octave_run_reports_its_reason(bench, octave, program: str, reason: str) -> None:
     octave(program)
     with pytest.raises(bench("accuracy.octave").Failed, match=reason):
         bench("accuracy.octave").run("", np.ones((2, 3, 2)), paths=[], seconds=1)
 
 
-def test_a_factorization_limits_the_bases_and_the_authors_numbers_come_first(bench) -> None:
+def test_basis_sizes_respect_the_factorization_and_prefer_published_ones(bench) -> None:
     peers, sequences = bench("accuracy.peers"), bench("sequences")
     tracks = Tracks.from_arrays(np.random.default_rng(1).normal(size=(8, 90, 2)))
     case = sequences.Case("some", tracks, None, None, None)
@@ -114,7 +114,7 @@ def test_a_factorization_limits_the_bases_and_the_authors_numbers_come_first(ben
     assert peers.bases("bmm", shark) == (4,)
 
 
-def test_folders_of_the_authors_are_found(bench, code) -> None:
+def test_the_folders_of_the_authors_code_are_found(bench, code) -> None:
     peers = bench("accuracy.peers")
     found = [str(path.relative_to(code)) for path in peers.paths(peers.PEERS["bmm"], code)]
     assert found == ["b", "c/Solver/Mexfun", "c/Solver", "c"]
@@ -122,7 +122,7 @@ def test_folders_of_the_authors_are_found(bench, code) -> None:
         peers.paths(peers.PEERS["pnd2"], code)
 
 
-def test_every_run_is_measured_once_and_its_failure_too(bench, octave, data, code, tmp_path, capsys) -> None:
+def test_each_run_is_measured_once_even_if_it_failed(bench, octave, data, code, tmp_path, capsys) -> None:
     peers, out = bench("accuracy.peers"), tmp_path / "peers.jsonl"
     given = ["--data", str(data), "--code", str(code), "--out", str(out), "--methods"]
     octave(FLAT.format(depth=0))
@@ -144,7 +144,7 @@ def test_every_run_is_measured_once_and_its_failure_too(bench, octave, data, cod
     assert out.read_text() == before
 
 
-def test_shapes_of_the_truth_have_no_error_in_any_unit(bench, octave, data, tmp_path) -> None:
+def test_true_shapes_in_another_unit_have_zero_error(bench, octave, data, tmp_path) -> None:
     peers = bench("accuracy.peers")
     case = next(iter(peers.complete(data, points=None, only=["seen"])))
     spread = case.tracks.points.std(axis=1).mean()
@@ -159,7 +159,7 @@ def test_shapes_of_the_truth_have_no_error_in_any_unit(bench, octave, data, tmp_
     assert row["value"] < 1e-12
 
 
-def test_the_table_has_the_best_number_of_bases_and_the_reason_of_a_failure(bench, tmp_path) -> None:
+def test_the_table_shows_the_best_basis_size_or_the_reason_of_failure(bench, tmp_path) -> None:
     peers, out = bench("accuracy.peers"), tmp_path / "peers.jsonl"
     same = {"sequence": "some", "frames": 8, "points": 30}
     lines = [
@@ -176,7 +176,7 @@ def test_the_table_has_the_best_number_of_bases_and_the_reason_of_a_failure(benc
     ]
 
 
-def test_peers_are_drawn_where_they_had_the_same_points(bench, monkeypatch) -> None:
+def test_peers_are_plotted_only_for_the_same_number_of_points(bench, monkeypatch) -> None:
     plots = bench("figures.plots")
     same = {"sequence": "mp_face37", "points": 37, "metric": "e3d_frame"}
     peers = [

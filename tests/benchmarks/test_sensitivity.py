@@ -1,4 +1,4 @@
-"""Constants doubled and halved: what is changed, and that everything computed from it follows."""
+"""Constants doubled and halved: what is changed, and that derived values follow."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ lower = 3.0
         ("FLOOR", 2.0, {"WEIGHT": 0.5, "FLOOR": -0.498}),
     ],
 )
-def test_one_constant_is_multiplied_and_what_is_computed_from_it_follows(
+def test_a_changed_constant_propagates_to_values_derived_from_it(
     name: str, factor: float, expected: dict[str, object]
 ) -> None:
     module: dict[str, object] = {}
@@ -41,12 +41,12 @@ def test_one_constant_is_multiplied_and_what_is_computed_from_it_follows(
 
 
 @pytest.mark.parametrize("name", ["UNIT", "lower", "MISSING"])
-def test_only_numbers_of_upper_case_names_are_constants(name: str) -> None:
+def test_only_upper_case_numbers_count_as_constants(name: str) -> None:
     with pytest.raises(LookupError, match=f"assigns no number to {name}"):
         changed(ast.parse(SOURCE), name, 2.0)
 
 
-def test_whole_numbers_stay_whole_and_counts_stay_counts() -> None:
+def test_multiplied_integers_stay_integers_and_counts_stay_positive() -> None:
     assert [multiplied(value, 0.5) for value in (8, 1, 0, -3, 3.0)] == [4, 1, 0, -3, 1.5]
 
 
@@ -69,9 +69,7 @@ def test_every_folder_and_module_named_has_constants() -> None:
 
 
 @pytest.mark.slow
-def test_solves_are_done_once_and_the_table_says_what_matters(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_solve_runs_once_and_the_table_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "sensitivity.jsonl"
     command = ["--only", "hyperparameters.BENDING_SHARE", "--workers", "1", "--out", str(out)]
     sensitivity.main(command)
@@ -85,7 +83,7 @@ def test_solves_are_done_once_and_the_table_says_what_matters(
     assert capsys.readouterr().out.count("1 constants:") == 2
 
 
-def test_a_change_that_fails_is_said() -> None:
+def test_a_change_that_cannot_be_applied_is_reported() -> None:
     refused = sensitivity.measured(
         sensitivity.Change("face, given cameras", "pliant.solver.model.so3", "MISSING", 2.0), 60
     )

@@ -1,4 +1,4 @@
-"""The speed benchmarks at tiny sizes: timing, limits of memory, and arithmetic."""
+"""The speed benchmarks at tiny sizes: timing, memory limits, and arithmetic."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ROOT = Path(__file__).parent.parent.parent
 
 @pytest.fixture
 def bench(monkeypatch):
-    """Import a module of the benchmarks as they import each other: from the root of the repository."""
+    """Return a function that imports a module of the benchmarks from the root of the repository, as they do."""
     monkeypatch.syspath_prepend(str(ROOT))
     return lambda name: import_module(f"benchmarks.{name}")
 
@@ -57,7 +57,7 @@ def test_every_baseline_is_timed_beside_the_solver():
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_growth_prints_an_exponent_for_each_size():
+def test_growth_prints_a_row_per_size_and_the_exponents():
     lines = speed("growth", "--against-points", "100,200", "--against-frames", "4,8")
     assert sum(line.startswith(("| 100 ", "| 200 ", "| 4 ", "| 8 ")) for line in lines) == 4
     assert sum(line.startswith("exponent in P of") for line in lines) == 3
@@ -88,7 +88,7 @@ def test_a_mesh_is_timed_against_a_grid():
     assert any("× the grid's time" in line for line in speed("mesh", "--frames", "6", "--points", "100"))
 
 
-def test_the_result_of_a_large_solve_lies_in_the_given_folder(bench, tmp_path, monkeypatch):
+def test_a_large_solve_keeps_its_result_in_the_scratch_folder(bench, tmp_path, monkeypatch):
     monkeypatch.setattr("pliant.solver.reconstruction.blocks.BLOCK_OBSERVATIONS", 100)
     side_by_side = bench("speed.side_by_side")
     solved, places = side_by_side.solve, []
@@ -105,19 +105,19 @@ def test_the_result_of_a_large_solve_lies_in_the_given_folder(bench, tmp_path, m
     assert places == [(tmp_path, True)]
 
 
-def test_exponent_of_a_known_law(bench):
+def test_the_exponent_of_a_power_law_is_recovered(bench):
     sizes = np.array([10.0, 20.0, 80.0])
     assert bench("speed.growth").exponent(sizes, 3 * sizes**1.25) == pytest.approx(1.25)
 
 
-def test_memory_of_one_process_is_its_own(bench):
+def test_the_memory_growth_of_a_child_process_is_measured(bench):
     measured = bench("speed.apart").apart(hold, 200_000_000)
     assert measured.value == 25_000_000
     assert 190e6 < measured.growth < 230e6
     assert measured.peak > measured.growth
 
 
-def test_running_out_of_memory_gives_no_number(bench):
+def test_running_out_of_memory_returns_none(bench):
     assert bench("speed.apart").apart(hold, 1 << 40, limit=1 << 32) is None
 
 

@@ -17,13 +17,13 @@ ROOT = Path(__file__).parent.parent.parent
 
 @pytest.fixture
 def bench(monkeypatch):
-    """Import a module of the benchmarks as they import each other: from the root of the repository."""
+    """Return a function that imports a module of the benchmarks from the root of the repository, as they do."""
     monkeypatch.syspath_prepend(str(ROOT))
     return lambda name: import_module(f"benchmarks.{name}")
 
 
 def solve_of(name: str, *, too_small: float, kind: str = "clean", count: int = 99) -> dict:
-    """A solve whose errors are normal with a standard deviation `too_small` times the one stated."""
+    """Return a solve with normal errors whose standard deviation is `too_small` times the stated one."""
     levels = np.arange(1, count + 1) / (count + 1)
     return {
         "sequence": name, "kind": kind, "true": 0.1, "interval": [0.05, 0.2],
@@ -41,7 +41,7 @@ def test_coverage_follows_from_quantiles(bench, count: int) -> None:
     assert tables.within({"sequence": "none"}) is None
 
 
-def test_sequences_count_equally_however_often_they_were_solved(bench) -> None:
+def test_pooling_weights_sequences_equally_whatever_their_solve_count(bench) -> None:
     tables = bench("trust_tables")
     often = [solve_of("often", too_small=1.0, kind=str(number)) for number in range(5)]
     often.append(solve_of("often with image_size", too_small=1.0))
@@ -52,7 +52,7 @@ def test_sequences_count_equally_however_often_they_were_solved(bench) -> None:
     assert "no solve" in tables.exceptions(often)
 
 
-def test_the_table_of_signs_counts_solves_by_their_true_error(bench) -> None:
+def test_the_table_of_warning_signs_counts_solves_by_true_error(bench) -> None:
     tables = bench("trust_tables")
     turns = {"degrees_per_frame": 1.0, "deformation_per_frame": 0.1}
     rows = [
@@ -69,8 +69,8 @@ def test_the_table_of_signs_counts_solves_by_their_true_error(bench) -> None:
     assert tables.separated([], [{"sequence": "of an older solver", "true": 0.1}]) == ""
 
 
-def test_the_committed_solves_keep_the_rule_of_the_verdict() -> None:
-    """A true error above .15 is never good, and one below .03 never do_not_use."""
+def test_the_committed_solves_obey_the_verdict_rules() -> None:
+    """A true error above .15 is never `good`; one below .03 is never `do_not_use`."""
     file = Path(__file__).parents[2] / "benchmarks" / "results" / "trust.jsonl"
     solves = [json.loads(line) for line in file.read_text().splitlines()]
     known = [solve for solve in solves if solve["true"] is not None and np.isfinite(solve["true"])]
@@ -81,7 +81,7 @@ def test_the_committed_solves_keep_the_rule_of_the_verdict() -> None:
 
 
 def recorded_sheet(folder: Path) -> None:
-    """The rolled sheet, as a recorded sequence."""
+    """Write the rolled sheet as a recorded sequence."""
     sheet = rolled_sheet()
     (folder / "rolled").mkdir(parents=True)
     np.savez(folder / "rolled" / "tracks.npz", tracks=sheet.tracks.points)
@@ -114,7 +114,7 @@ def test_other_methods_on_a_sheet_are_measured_once_and_tabulated(bench, tmp_pat
     assert "| rolled | clean | – | – | – |" in capsys.readouterr().out
 
 
-def test_shapes_that_are_another_methods_reconstruction_are_no_truth(bench) -> None:
+def test_reconstructions_by_other_methods_are_not_ground_truth(bench) -> None:
     tables = bench("trust_tables")
     solves = [{**solve_of(name, too_small=1.0), "verdict": "good", "true": 0.01} for name in ("one", "dinosaur_real")]
     found = tables.confusion("Others", tables.with_truth(solves))

@@ -1,6 +1,6 @@
-"""Faults of an installation over several hosts, in network namespaces made here.
+"""Faults of an installation across several hosts, each a network namespace.
 
-After each fault every acknowledged job has ended as it should, once; `fsck` has no finding; no working file and no file of a stale
+After each fault every acknowledged job has ended once, as it should; `fsck` has no findings; no working file and no file of a stale
 attempt is left. The last test writes the table of all faults to `build/two-hosts.md`.
 """
 
@@ -42,7 +42,7 @@ def hosts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hosts]:
 
 @pytest.fixture(autouse=True)
 def sound(hosts: Hosts) -> Iterator[None]:
-    """Before each fault two workers are there; after it nothing is lost, doubled or left over."""
+    """Require two workers before each fault, and nothing lost, duplicated or left over after it."""
     hosts.until(lambda: hosts.workers() == 2, "both workers are there")
     yield
     misfits = hosts.misfits()
@@ -53,12 +53,12 @@ def sound(hosts: Hosts) -> Iterator[None]:
 
 
 def row(fault: str, *, noticed: float | None = None, moved: float | None = None) -> None:
-    """Note a line of the table."""
+    """Record a row of the table."""
     UNDER_WAY.append((fault, *("–" if each is None else f"{each:.1f} s" for each in (noticed, moved))))
 
 
 def moved(hosts: Hosts, id: str, began: float) -> tuple[float, float]:
-    """Wait until a job is taken from its worker, and until another one solves it; return both times since the fault."""
+    """Wait until a job is taken from its worker and solved by another; return both times since the fault."""
     hosts.until(lambda: hosts.get(id).get("attempt") != 1 or hosts.get(id)["status"] == "queued", "it is noticed")
     noticed = time.monotonic() - began
     hosts.until(lambda: hosts.get(id).get("attempt") == 2 and hosts.get(id)["progress"], "another worker has it")
@@ -74,7 +74,7 @@ def test_a_killed_host_loses_nothing(hosts: Hosts) -> None:
     times = moved(hosts, id, began)
     hosts.cancelled(id)
     hosts.network.plug(host)
-    for left in hosts.at_work(host):  # a minute passes: younger ones may belong to a worker that is being reaped
+    for left in hosts.at_work(host):  # age them: younger ones may belong to a worker being reaped
         os.utime(hosts.folder / host / "data" / "work" / left, (time.time() - 120, time.time() - 120))
     hosts.start_workers(host)
     hosts.until(lambda: not hosts.at_work(host), "the host clears what its killed worker left")
@@ -116,7 +116,7 @@ def test_redis_cut_off_for_longer_than_a_lease_moves_no_job(hosts: Hosts) -> Non
     row("Redis is cut off while S3 stays")
 
 
-def test_redis_restarted_in_mid_job_moves_no_job(hosts: Hosts) -> None:
+def test_a_redis_restart_during_a_job_moves_no_job(hosts: Hosts) -> None:
     id = hosts.submit()
     hosts.host_of(id)
     hosts.signal("valkey", signal.SIGKILL)
@@ -145,7 +145,7 @@ def test_one_key_at_two_api_processes_makes_one_job(hosts: Hosts) -> None:
     row("one request at two API processes at once")
 
 
-def test_an_upload_begun_at_a_killed_api_process_continues_at_the_other(hosts: Hosts) -> None:
+def test_an_upload_resumes_at_another_api_process_after_a_kill(hosts: Hosts) -> None:
     data = hosts.tracks()
     half = {"Upload-Complete": "?0", "Upload-Length": str(len(data))}
     begun = httpx.put(f"{hosts.urls[0]}/v1/uploads/across", content=data[:5000], headers=half, timeout=20)
@@ -166,7 +166,7 @@ def test_an_upload_begun_at_a_killed_api_process_continues_at_the_other(hosts: H
 
 @contextmanager
 def s3_away(hosts: Hosts, how: str) -> Iterator[None]:
-    """Let S3 drop packets, or refuse connections, while the block runs."""
+    """Make S3 drop packets, or refuse connections, while the block runs."""
     if how == "dropped":
         hosts.network.pull("s3")
     else:
@@ -181,12 +181,12 @@ def s3_away(hosts: Hosts, how: str) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("how", [pytest.param("dropped", marks=pytest.mark.long), "refused"])
-def test_a_job_that_ends_while_s3_is_away_keeps_its_result(hosts: Hosts, how: str) -> None:
+def test_a_job_that_finishes_during_an_s3_outage_keeps_its_result(hosts: Hosts, how: str) -> None:
     id = hosts.submit(reweightings=12)
     hosts.host_of(id)
     with s3_away(hosts, how):
         hosts.until(lambda: hosts.get(id).get("progress", {})["stage"] == "exporting", "it has its result")
-        with ThreadPoolExecutor(8) as pool:  # others ask for files meanwhile
+        with ThreadPoolExecutor(8) as pool:  # others query readiness meanwhile
             began = time.monotonic()
             asked = [pool.submit(httpx.get, f"{hosts.urls[0]}/readyz", timeout=30) for _ in range(8)]
             slowest = 0.0
@@ -206,7 +206,7 @@ def test_a_job_that_ends_while_s3_is_away_keeps_its_result(hosts: Hosts, how: st
     row(f"S3 is away when a job ends ({how})")
 
 
-def test_an_attempt_frozen_past_its_lease_and_thawed_writes_nothing(hosts: Hosts) -> None:
+def test_an_attempt_frozen_past_its_lease_writes_nothing_when_resumed(hosts: Hosts) -> None:
     id = hosts.submit(reweightings=15)
     host = hosts.host_of(id)
     hosts.signal(host, signal.SIGSTOP)
@@ -225,7 +225,7 @@ def test_an_attempt_frozen_past_its_lease_and_thawed_writes_nothing(hosts: Hosts
 
 
 @pytest.mark.long
-def test_clocks_that_differ_by_minutes_harm_nothing(hosts: Hosts) -> None:
+def test_jobs_succeed_with_worker_clocks_ten_minutes_apart(hosts: Hosts) -> None:
     shifts = [clock_shift(300), clock_shift(-300)]
     if None in shifts:
         pytest.skip("the clock is shifted with libfaketime: pip install libfaketime")
@@ -248,8 +248,8 @@ def test_clocks_that_differ_by_minutes_harm_nothing(hosts: Hosts) -> None:
 
 
 @pytest.mark.long
-def test_a_disk_that_is_five_times_slower_harms_nothing(hosts: Hosts) -> None:
-    """Valkey and S3 run for a fifth of the time, in slices, as behind a disk that cannot follow."""
+def test_jobs_succeed_with_valkey_and_s3_at_a_fifth_of_their_speed(hosts: Hosts) -> None:
+    """Valkey and S3 run a fifth of the time, in slices, as on a disk that cannot keep up."""
     stop = threading.Event()
 
     def slow() -> None:

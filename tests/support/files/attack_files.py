@@ -1,7 +1,7 @@
-"""Crafted files, each made here from nothing, and what must come back. No sample of a program that hurts; none is kept on disk.
+"""Crafted files, generated here, and the error codes they must get. None is working malware, and none is kept on disk.
 
-An attack is a form: the crafted part, an honest track file where the part is another one, and texts. `codes` are the only answers
-that count as a defence; which of several comes depends on the library that meets the file first.
+An attack is a form: the crafted part, an honest track file if the crafted part is another one, and texts. Only the error codes in
+`codes` count as a defence; which of several is returned depends on the library that meets the file first.
 """
 
 # ruff: noqa: E501
@@ -264,4 +264,4 @@ OVER_HTTP = (
     "zip bomb", "pickle", "HDF5 bomb", "MAT packed bomb", "OBJ of indices", "glTF lying length", "PNG bomb", "film of huge pictures",
     "huge numbers in options", "nested options",
 )  # fmt: skip
-"""One of each format, and those that a service meets before any reader."""
+"""One per format, and those that the service handles before any reader."""

@@ -1,4 +1,4 @@
-"""The parts that crafted files are made of: archives, HDF5, MAT, PLY, glTF and PNG that are not what they say."""
+"""Building blocks of crafted files: archives, HDF5, MAT, PLY, glTF and PNG that are not what they claim to be."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ import numpy as np
 import scipy.io
 
 CANARY = Path(tempfile.gettempdir()) / "pliant-canary-of-the-attack-tests"
-"""What code that ran would make."""
+"""The file that exists if code in a crafted file was run."""
 
 SECRET = "/etc/passwd"
 
 
 class Runs:
-    """Unpickling this makes the canary."""
+    """Unpickling this creates the canary."""
 
     def __reduce__(self) -> tuple[object, ...]:
         return (open, (str(CANARY), "w"))
@@ -59,9 +59,9 @@ def archive(*members: tuple[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> 
 
 
 def deflated(start: bytes, megabytes: int, *, window: int = 15) -> bytes:
-    """A zlib stream (raw deflate with a window of −15) of some bytes and so many megabytes of zeros behind them.
+    """Return a zlib stream (raw deflate with a window of −15) of `start` and so many megabytes of zeros after it.
 
-    Compressed is one megabyte: flushed before and after, it is the same whatever stands before it.
+    Only one megabyte is compressed: flushed before and after, its block is the same whatever precedes it.
     """
     packer, zero = zlib.compressobj(9, zlib.DEFLATED, window), bytes(1 << 20)
     head = packer.compress(start) + packer.flush(zlib.Z_FULL_FLUSH)
@@ -76,7 +76,7 @@ def deflated(start: bytes, megabytes: int, *, window: int = 15) -> bytes:
 
 
 def zeros(megabytes: int, shape: str) -> bytes:
-    """An npz of this many megabytes of zeros behind a header, a thousandth of that on disk."""
+    """Return an npz of a header and this many megabytes of zeros, a thousandth of that on disk."""
     start, zero = header(described(shape)), bytes(1 << 20)
     check, name = zlib.crc32(start), b"tracks.npy"
     for _ in range(megabytes):
@@ -94,14 +94,14 @@ def patched(content: bytes, old: bytes, new: bytes, *, count: int = -1) -> bytes
 
 
 def declared_smaller() -> bytes:
-    """A member whose directory entry tells 1 kB where 4 MB inflate."""
+    """Return an archive with a member of 4 MB whose directory entry claims 1 kB."""
     whole = archive(("tracks.npy", header(described("(64, 4096, 2)")) + bytes(64 * 4096 * 16)))
     size = struct.pack("<L", len(header(described("(64, 4096, 2)"))) + 64 * 4096 * 16)
     return patched(whole, size, struct.pack("<L", 1024))
 
 
 def overlapping() -> bytes:
-    """One compressed member that sixty directory entries share."""
+    """Return an archive of one compressed member that sixty directory entries share."""
     whole = bytearray(archive(("tracks.npy", HONEST)))
     start = whole.find(b"PK\x01\x02")
     end = whole.find(b"PK\x05\x06")
@@ -180,7 +180,7 @@ def mat_element(kind: int, content: bytes, *, size: int | None = None) -> bytes:
 
 
 def mat_matrix(dims: tuple[int, ...], *, size: int | None = None, data: bytes = bytes(64), flags: int = 6) -> bytes:
-    """One variable W of doubles, with whatever dimensions and sizes."""
+    """Return one variable W of doubles, with arbitrary dimensions and sizes."""
     inside = mat_element(6, struct.pack("<II", flags, 0)) + mat_element(5, struct.pack(f"<{len(dims)}i", *dims))
     inside += mat_element(1, b"W") + mat_element(9, data, size=size)
     return MAT_HEADER + mat_element(14, inside)
@@ -201,7 +201,7 @@ def mat_nested(depth: int) -> bytes:
 
 
 def mat_packed_bomb() -> bytes:
-    """A compressed variable that inflates to a gigabyte whatever it says of itself."""
+    """Return a compressed variable that inflates to a gigabyte, whatever its dimensions are."""
     inside = (
         mat_element(6, struct.pack("<II", 6, 0)) + mat_element(5, struct.pack("<2i", 10, 10)) + mat_element(1, b"W")
     )
@@ -236,7 +236,7 @@ def glb(document: object, binary: bytes = b"", *, length: int | None = None) -> 
 
 
 def gltf(**changed: object) -> dict[str, object]:
-    """A document of 20 vertices and 2 triangles, with parts exchanged."""
+    """Return a document of 20 vertices and 2 triangles, with some parts replaced."""
     document: dict[str, object] = {
         "asset": {"version": "2.0"}, "buffers": [{"byteLength": 264}],
         "bufferViews": [{"buffer": 0, "byteLength": 240}, {"buffer": 0, "byteOffset": 240, "byteLength": 24}],

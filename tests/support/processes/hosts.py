@@ -1,4 +1,4 @@
-"""An installation over five hosts: one with two API processes and the reconciler, two with a worker each, one with Valkey, one with S3."""
+"""An installation on five hosts: one with two API processes and the reconciler, two with a worker each, one with Valkey, one with S3."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SHORT_TIMERS = {
 
 
 class Hosts:
-    """Starts in `with`; every process is on the host it belongs to, and none is left behind."""
+    """Processes that run inside `with`, each on its host; none may be left behind."""
 
     def __init__(self, folder: Path, network: Network) -> None:
         self.folder, self.network = folder, network
@@ -139,7 +139,7 @@ class Hosts:
             self._processes[name].wait(30)
 
     def host_of(self, id: str) -> str:
-        """Return the host whose worker has a job process, waiting until its job is in the midst of the solver."""
+        """Wait until the solver runs the job, and return the host whose worker has a job process."""
         self.until(lambda: (self.get(id).get("progress") or {}).get("reweighting", 0) > 0, "it solves", seconds=40)
         found = [host for host in WORKER_HOSTS if self.job_process(host)]
         assert len(found) == 1, found
@@ -172,7 +172,7 @@ class Hosts:
         return id
 
     def get(self, id: str) -> dict[str, Any]:
-        """Return a job, empty while the service has no answer."""
+        """Return a job, or an empty dict while the service does not answer."""
         try:
             answer = self.http.get(f"/v1/jobs/{id}")
         except httpx.TransportError:
@@ -180,7 +180,7 @@ class Hosts:
         return dict(answer.json()) if answer.status_code == 200 else {}
 
     def answers(self, url: str) -> bool:
-        """Tell whether an address is answered with 200."""
+        """Return True if the address returns 200."""
         try:
             return self.http.get(url).status_code == 200
         except httpx.TransportError:
@@ -209,12 +209,12 @@ class Hosts:
         return self.get(id)
 
     def cancelled(self, id: str) -> None:
-        """End a long job."""
+        """Cancel a job and wait for its end."""
         self.http.post(f"/v1/jobs/{id}/cancel")
         assert self.final(id)["status"] == "cancelled"
 
     def misfits(self) -> dict[str, list[str]]:
-        """Return the acknowledged jobs that are lost, those that are there twice, and what is left over once things have settled."""
+        """Return the jobs that are lost, those that exist without an acknowledgement, and what is left over in the end."""
         found = [f"working files on {host}: {self.at_work(host)}" for host in WORKER_HOSTS if not self._cleared(host)]
         fsck = subprocess.run(
             self.network.command("front", [sys.executable, "-m", "pliant.worker", "fsck"]),
@@ -234,7 +234,7 @@ class Hosts:
     def blobs(self, id: str) -> list[str]:
         """Return the files that S3 holds for a job."""
         stored = [path for path in (self.folder / "s3" / "bucket").rglob("*") if path.is_file() and id in str(path)]
-        noted = {f"{path.name}.json" for path in stored}  # what nanio notes of each file
+        noted = {f"{path.name}.json" for path in stored}  # nanio's metadata of each file
         return sorted(path.name for path in stored if path.name not in noted)
 
     def tail(self) -> str:

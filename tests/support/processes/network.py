@@ -15,7 +15,7 @@ _CLONE_NEWNET = 0x40000000
 
 
 def reason_against() -> str | None:
-    """Return why no network can be made here, None if one can."""
+    """Return why no network can be created here, or None."""
     if os.name != "posix" or not hasattr(os, "geteuid") or os.geteuid() != 0:
         return "network namespaces need root"
     if shutil.which("ip") is None:
@@ -76,7 +76,7 @@ class Network:
 
     @contextmanager
     def on(self, name: str) -> Iterator[None]:
-        """Let this thread, and the threads it starts, be on a host."""
+        """Run this thread, and the threads it starts, on a host."""
         libc = ctypes.CDLL(None, use_errno=True)
         home = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
         there = os.open(f"/run/netns/{self._space(name)}", os.O_RDONLY)

@@ -1,4 +1,4 @@
-"""What tests of the page do again and again: give it files, wait, read a chart, move to a frame."""
+"""Common steps of the page's tests: give it files, wait, read a chart, move to a frame."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from playwright.sync_api import Locator, Page
 TRACKS = "tracks.npz"
 DONE = 180_000
 QUICK = json.dumps({"camera": "orthographic", "surface": "free", "refine_rotations": False})
-"""Options of a job whose result is only shown: a third of the default's time."""
+"""Options of a job whose result is only shown; it takes a third of the default's time."""
 
 BOTH_WIDTHS_AND_THEMES = [
     (1280, "light"),
@@ -55,7 +55,7 @@ def drop(page: Page, files: dict[str, bytes]) -> None:
 
 
 def until(holds: Callable[[], bool], seconds: float = 30) -> None:
-    """Wait in Python: the browser's own way to wait evaluates strings, which the page's policy forbids."""
+    """Wait in Python: Playwright's own wait evaluates strings, which the content security policy forbids."""
     end = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < end, "it did not happen in time"

@@ -14,7 +14,7 @@ def forget_peak(pid: int) -> None:
 
 
 def peak_of(pid: int) -> int:
-    """Bytes."""
+    """Return the peak in bytes."""
     for line in Path(f"/proc/{pid}/status").read_text().splitlines():
         if line.startswith("VmHWM:"):
             return int(line.split()[1]) * 1024
@@ -32,7 +32,7 @@ class Watched:
 
 @contextmanager
 def watched(pid: int, *, every: float = 0.003) -> Iterator[Watched]:
-    """Look at a process and its descendants, again and again; a child's own high-water mark makes gaps harmless."""
+    """Poll a process and its descendants; a child's own high-water mark makes gaps harmless."""
     found, over, seen = Watched(), threading.Event(), set[int]()
 
     def look() -> None:

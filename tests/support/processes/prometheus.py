@@ -1,6 +1,6 @@
-"""What Prometheus would answer: PromQL, parsed by promql-parser, on what a service's /metrics said at some moments.
+"""A small Prometheus: evaluates PromQL, parsed by promql-parser, on scrapes of a service's /metrics.
 
-Of PromQL it has what the dashboard and the alert rules use. Rates are taken between the first and the last scrape of the window,
+It supports the PromQL that the dashboard and the alert rules use. Rates are taken between the first and the last scrape of the window,
 without Prometheus' extrapolation to its ends.
 """
 
@@ -40,7 +40,7 @@ class Prometheus:
     pending: dict[str, float] = field(default_factory=dict)
 
     def scrape(self, text: str, *, at: float) -> None:
-        """Keep what /metrics said at a moment in seconds."""
+        """Store the output of /metrics at a time in seconds."""
         samples: dict[str, Vector] = defaultdict(dict)
         for family in text_string_to_metric_families(text):
             for sample in family.samples:
@@ -54,7 +54,7 @@ class Prometheus:
         return value
 
     def firing(self, rules: list[Mapping[str, Any]]) -> set[str]:
-        """Evaluate alert rules at the last scrape, as at each before, and return those that fire."""
+        """Evaluate alert rules at the last scrape, after doing so at each earlier one, and return those that fire."""
         now, fired = self.scrapes[-1][0], set()
         for rule in rules:
             name = rule["alert"]

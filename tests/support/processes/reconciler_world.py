@@ -1,4 +1,4 @@
-"""Jobs in memory and a reconciler, on clocks that a test turns."""
+"""Jobs in memory and a reconciler, on clocks that a test advances."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pliant.worker.store.memory import MemoryQueue, MemoryRecords
 
 
 class World:
-    """Jobs in memory, two clocks that we turn, a reconciler."""
+    """Jobs in memory, a reconciler, and the wall and monotonic clocks that a test advances."""
 
     def __init__(self, data: Path, **settings: object) -> None:
         self.now = datetime(2030, 1, 1, tzinfo=UTC)

@@ -1,4 +1,4 @@
-"""A whole result without solving: a waving sheet as solution and truth, for tests of what is written."""
+"""A complete result without solving: a waving sheet as solution and truth, for tests of written files."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def make_result(
     texture: bool = False,
     **options: Any,
 ) -> tuple[Inputs, Solution, Options]:
-    """Inputs and the solution that belongs to them.
+    """Return inputs and their solution.
 
     `mesh` is grid, triangles or none; with `truth` the result is off by a smooth error; with `hidden` a third of the observations and
     the whole of point 3 and frame 2 are hidden; without `std` the solver has estimated no deviations.
@@ -107,5 +107,5 @@ def make_texture(rows: int, columns: int) -> Texture:
 
 
 def _off(frames: int, points: int) -> np.ndarray:
-    """What the truth has more than the result: ever more depth from the first point to the last, and from frame to frame."""
+    """Return truth minus result: depth that grows from the first point to the last and from frame to frame."""
     return np.linspace(0, 1, frames)[:, None, None] * np.linspace(0, 3, points)[:, None] * np.array([0.0, 0.0, 1.0])

@@ -1,4 +1,4 @@
-"""What tests of the service work with: a running one, forms, and the steps of a worker."""
+"""A running service, forms and worker steps for tests of the service."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NOW = datetime(2026, 5, 4, 9, 30, tzinfo=UTC)
 
 @dataclass(frozen=True)
 class Running:
-    """A service that answers, and what stands behind it."""
+    """A running service and its parts."""
 
     url: str
     jobs: Jobs
@@ -45,7 +45,7 @@ class Running:
     def left_on_disk(self) -> list[Path]:
         """Everything in the incoming folder but the process's own lock and empty folder.
 
-        What vanishes meanwhile is not counted: `Path.rglob` would raise there.
+        Entries that vanish meanwhile are not counted; `Path.rglob` would raise.
         """
         held = [Path(folder, name) for folder, *names in os.walk(self.jobs.settings.incoming) for name in chain(*names)]
         return [path for path in held if len(path.relative_to(self.jobs.settings.incoming).parts) > 1]
@@ -57,7 +57,7 @@ class Running:
 
     @property
     def waiting(self) -> int:
-        """How many jobs there are."""
+        """Number of jobs."""
         return len(self.jobs.page(limit=200).jobs)
 
 
@@ -80,7 +80,7 @@ def until(holds: Callable[[], Any], *, seconds: float = 10.0) -> None:
 
 
 def free_port() -> int:
-    """Return a TCP port that nobody listens on now."""
+    """Return a TCP port that is currently free."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -88,7 +88,7 @@ def free_port() -> int:
 
 
 def heard(connection: socket.socket, words: bytes) -> bytes:
-    """Read an answer until these words have come, in however many pieces; fail if it ends without them."""
+    """Read a response, in however many pieces, until it contains these words; fail if it ends without them."""
     answer = b""
     while words not in answer:
         piece = connection.recv(65536)
@@ -131,7 +131,7 @@ def claim(running: Running, id: str) -> str:
 
 
 def finish(running: Running, id: str, contents: bytes, *, name: str = "shapes.npz") -> None:
-    """Do as a worker would: claim the job, store a file, publish it."""
+    """Act as a worker: claim the job, store a file, publish it."""
     attempt_id = claim(running, id)
     file = running.jobs.settings.data / f"{id}.tmp"
     file.write_bytes(contents)

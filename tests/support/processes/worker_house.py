@@ -1,4 +1,4 @@
-"""A whole house of real processes for the fault tests: workers, reconciler, and Valkey if it is to be killed."""
+"""Real processes for the fault tests: workers, reconciler, and Valkey if a test kills it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pliant.worker.processes.valkey import Valkey
 from pliant.worker.settings import Settings
 
 SHORT = Options(prior="smooth", max_reweightings=3, refine_rotations=False, surface="free", camera="orthographic")
-"""Options of a job of a moment: the default prior takes ten times as long."""
+"""Options of a short job: the default prior takes ten times as long."""
 
 
 def make_inputs(path: Path, *, frames: int, points: int) -> Inputs:
@@ -30,7 +30,7 @@ def make_inputs(path: Path, *, frames: int, points: int) -> Inputs:
 
 
 def make_long_inputs(path: Path) -> Inputs:
-    """Canonical inputs of a job that is only ever ended from outside."""
+    """Write canonical inputs of a job that runs until it is stopped."""
     sequence = long_sequence()
     return _saved(path, sequence.tracks, None, None, KnownCamera(sequence.rotations))
 
@@ -54,7 +54,7 @@ def _saved(
 
 
 class House:
-    """Starts in `with`, and must leave no process behind."""
+    """Processes that run inside `with` and must leave none behind."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class House:
         return self.jobs.submit(file, submission, interpretation=interpretation).id
 
     def until(self, condition: Callable[[], object], what: str, *, seconds: float = 20.0) -> float:
-        """Poll, keeping the children running; return how long it took."""
+        """Poll while the supervisor keeps the children running; return the seconds it took."""
         began = time.monotonic()
         while not condition():
             self.supervisor.look()
@@ -110,7 +110,7 @@ class House:
         return self.jobs.get(id)
 
     def solving(self, id: str) -> Job:
-        """Wait until the job is in the midst of the solver."""
+        """Wait until the solver is running the job."""
 
         def midst() -> bool:
             job = self.jobs.get(id)
@@ -133,7 +133,7 @@ class House:
 
 
 def children(pid: int) -> list[int]:
-    """Child processes that are no zombies."""
+    """Return the child processes that are not zombies."""
     found: list[int] = []
     with suppress(OSError):  # it has ended
         for task in Path(f"/proc/{pid}/task").iterdir():
@@ -142,7 +142,7 @@ def children(pid: int) -> list[int]:
 
 
 def running(pid: int) -> bool:
-    """Neither gone nor a zombie."""
+    """Return True if the process exists and is not a zombie."""
     try:
         os.kill(pid, 0)
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
@@ -151,6 +151,6 @@ def running(pid: int) -> bool:
 
 
 def settled(house: House) -> None:
-    """No job process runs, no working files are left, and the stores are consistent with the job records."""
+    """Wait until no job process runs and no working files are left; check the stores against the job records."""
     house.until(lambda: not house.job_processes() and not house.files_at_work(), "nothing is left behind")
     assert findings(house.jobs, pause=0.5) == []

@@ -1,4 +1,4 @@
-"""How far found cameras are from the true ones."""
+"""The error of estimated cameras."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pliant.solver.model.so3 import MIRROR, angles_between, nearest
 
 
 def degrees_apart(found: np.ndarray, truth: np.ndarray) -> float:
-    """Return the mean angle in degrees, one world rotation and the depth mirror free."""
+    """Return the mean angle in degrees after alignment by one world rotation and the depth mirror."""
     errors = []
     for mirror in (np.eye(3), MIRROR):
         turned = mirror @ found @ mirror

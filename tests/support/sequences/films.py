@@ -22,7 +22,7 @@ def rendered(sequence: Sequence, path: Path, **options: object) -> RenderedFilm:
 
 
 def accuracy(tracked: TrackedFilm, film: RenderedFilm) -> dict[str, float]:
-    """Compare tracks with the truth: error of rightly visible points in pixels, precision and recall of visibility."""
+    """Compare tracks with the truth: error of correctly visible points in pixels, precision and recall of visibility."""
     start = int(tracked.film.frame_indices[tracked.template])
     true, seen, _ = film.follow(tracked.tracks[tracked.template].astype(float), start)
     true, seen = true[tracked.film.frame_indices], seen[tracked.film.frame_indices]

@@ -1,4 +1,4 @@
-"""The job that is long on any machine: tests end it from outside. Its home is with the benchmarks, which have the same need."""
+"""A job that is long on any machine and that tests stop. It is defined in the benchmarks, which need it too."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ LONG, long_sequence = _HOME["LONG"], _HOME["long_sequence"]
 
 
 def long_request() -> dict[str, Any]:
-    """What `Client.submit` is given for it."""
+    """Return the arguments of `Client.submit` for it."""
     sequence = long_sequence()
     return {"tracks": sequence.tracks.points, "mesh": "none", "rotations": sequence.rotations, "options": LONG}

@@ -37,7 +37,7 @@ def project(shapes: np.ndarray, rotations: np.ndarray, scales: np.ndarray | floa
 
 
 def triangulated(grid: np.ndarray) -> Mesh:
-    """The grid's cells cut into triangles: a mesh that does not know it is a grid."""
+    """Return the grid's cells cut into triangles, a mesh without grid structure."""
     a, b, c, d = (g.ravel() for g in (grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]))
     keep = (np.stack([a, b, c, d]) >= 0).all(axis=0)
     return Mesh.from_faces(
