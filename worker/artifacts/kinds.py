@@ -127,6 +127,14 @@ def _rgba(colours: Floats) -> NDArray[np.uint16]:
     return np.asarray(np.rint(shares * 65535).astype(np.uint16))
 
 
+def _plain(write: Callable[[Result, IO[bytes], OnProgress], None]) -> Callable[..., dict[str, Any]]:
+    def written(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
+        write(result, file, on_progress)
+        return {}
+
+    return written
+
+
 def _painted(write: Callable[[Result, IO[bytes], OnProgress], None]) -> Callable[..., dict[str, Any]]:
     def written(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
         write(result, file, on_progress)
@@ -167,9 +175,9 @@ KINDS = (
     Kind("shapes_obj.zip", "obj", "application/zip", "One OBJ for each frame.", 13, _painted(write_obj_zip)),
     Kind("shapes.usdc", "usd", "application/octet-stream", "The moving mesh as USD, y up.", 8, _painted(usd.write_usd), textured=False),
     Kind("shapes.usdz", "usd", "model/vnd.usdz+zip", "USD, y up, with its picture.", 8, _painted(usd.write_usdz), textured=True),
-    Kind("shapes.abc", "abc", "application/octet-stream", "The moving mesh as Alembic, y up.", 8, _painted(alembic.write_alembic)),
+    Kind("shapes.abc", "abc", "application/octet-stream", "The moving mesh as Alembic, y up.", 8, _plain(alembic.write_alembic)),
     Kind("shapes.mat", "mat", "application/x-matlab-data", "The same arrays for MATLAB; faces from 1.", 2, _at_once(matlab.write_mat)),
-    Kind("shapes.mdd", "mdd", "application/octet-stream", "Point cache for Blender, Maya and Houdini, y up.", 2, _painted(write_mdd)),
+    Kind("shapes.mdd", "mdd", "application/octet-stream", "Point cache for Blender, Maya and Houdini, y up.", 2, _plain(write_mdd)),
     Kind("metrics_frames.csv", "csv", "text/csv", "Metrics of every frame.", 2, _at_once(write_frames_csv)),
     Kind("metrics_points.csv", "csv", "text/csv", "Metrics of every point.", 1, _at_once(write_points_csv)),
     Kind(preview.NAME, None, preview.MEDIA_TYPE, preview.DESCRIPTION, 4, _at_once(_preview)),

@@ -1,20 +1,21 @@
 """The isolated reader: read large inputs in a separate process, so that the server's memory does not grow.
 
 Validating and converting a gigabyte of tracks takes several gigabytes, freed memory rarely returns to the system, and a crafted file
-may declare a hundred times its size. Inputs that declare more than `LARGE` bytes are therefore read, validated and stored by a process
-with its own limits; the server receives the interpretation or the error. Smaller inputs are read in the server.
+may expand to a hundred times its size and more. Inputs that declare more than `LARGE` bytes are therefore read, validated and stored by a
+process with its own limits; the server receives the interpretation or the error. Smaller inputs are read in the server, unless a file
+expands to more than `LARGE` bytes after all, such as a table of few observations in many frames.
 """
 
 from __future__ import annotations
 
 import math
-import os
 import resource
 import signal
 import sys
+import tempfile
 import zipfile
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -36,7 +37,7 @@ GROWTH = {b"MATLAB": 1032, b"\x89PNG": 8 * 1032}
 """Maximum expansion of a byte: 1032 by deflate, for masks times 8 bytes for a pixel's point index."""
 
 TEXT = 8
-"""Maximum expansion of a byte of text or of a mesh file."""
+"""Usual expansion of a byte of text or of a mesh file."""
 
 NUMBER = 8
 """Bytes of a number in memory, however it is stored."""
@@ -69,9 +70,13 @@ def store_inputs(
     """
     parts: dict[str, Any] = {"tracks": tracks, "mesh": mesh, "ground_truth": ground_truth, "rotations": rotations}
     files = {name: part for name, part in parts.items() if isinstance(part, Path)}
-    if sum(declared_bytes(path, field=name) for name, path in files.items()) > LARGE:
-        return _in_process(parts, options, limits, target)
-    return _here(parts, options, limits, target)
+    if sum(declared_bytes(path, field=name) for name, path in files.items()) <= LARGE:
+        try:
+            return _here(parts, options, replace(limits, max_bytes=min(limits.max_bytes, LARGE)), target)
+        except InvalidInput as error:
+            if error.code != "too_large":
+                raise
+    return _in_process(parts, options, limits, target)
 
 
 def _here(parts: dict[str, Any], options: Options, limits: Limits, target: Path | None) -> Interpretation:
@@ -82,7 +87,7 @@ def _here(parts: dict[str, Any], options: Options, limits: Limits, target: Path 
 
 
 def declared_bytes(path: Path, *, field: str) -> int:
-    """Return the maximum size of a file in memory, from its declared sizes or the maximum expansion of its format.
+    """Return the size of a file in memory, from its declared sizes or the expansion of its format.
 
     Raises
     ------
@@ -126,8 +131,8 @@ def _in_process(parts: dict[str, Any], options: Options, limits: Limits, target:
         "options": options.model_dump(mode="json"), "limits": asdict(limits),
         "target": None if target is None else str(target.absolute()),
     }  # fmt: skip
-    passed = {name: os.environ[name] for name in ("TMPDIR",) if name in os.environ}
-    ended = run_contained(MODULE, request, seconds=limits.read_seconds, environment=passed)
+    with tempfile.TemporaryDirectory(prefix="pliant-read-") as scratch:  # also removes what a killed process leaves
+        ended = run_contained(MODULE, request, seconds=limits.read_seconds, environment={"TMPDIR": scratch})
     if ended.code == DONE:
         return Interpretation.model_validate_json(ended.answer)
     if ended.overdue:

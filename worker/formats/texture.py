@@ -12,6 +12,9 @@ from pliant.solver import InvalidInput
 QUALITY = 90
 """JPEG quality, 1 to 95. Pillow's documentation puts high quality at 90; above 95 files grow without visible gain."""
 
+MAX_SIDE = 65_500
+"""Largest width or height of a JPEG that libjpeg writes, pixels."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texture:
@@ -38,9 +41,16 @@ class Texture:
         from PIL import Image
 
         picture, places = np.asarray(template_rgb), np.array(uv, dtype=np.float32, order="C")
-        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
+        if (
+            picture.dtype != np.uint8
+            or picture.ndim != 3
+            or picture.shape[2] != 3
+            or picture.size == 0
+            or max(picture.shape) > MAX_SIDE
+        ):
             raise InvalidInput(
-                "wrong_shape", field="texture", expected="a picture (H, W, 3) of uint8", got=f"{picture.dtype} {picture.shape}",
+                "wrong_shape", field="texture", expected=f"a picture (H, W, 3) of uint8, up to {MAX_SIDE:,} pixels a side",
+                got=f"{picture.dtype} {picture.shape}",
                 hint="Give the template frame as RGB.",
             )  # fmt: skip
         if places.ndim != 2 or places.shape[1] != 2:

@@ -261,6 +261,12 @@ def test_expected_error_colours_are_in_percent_and_hidden_points_are_grey(tmp_pa
     assert b"(percent of the object's size) and above" in members(files["shapes_ply.zip"])[0]
 
 
+def test_only_files_with_colours_have_a_legend(tmp_path: Path) -> None:
+    files = write(tmp_path, make_result(outputs="ply,mdd", colours="error"))
+    assert "colours" in description(files, "shapes_ply.zip")
+    assert "colours" not in description(files, "shapes.mdd")
+
+
 def test_mean_colours_use_only_visible_observations() -> None:
     values = np.array([[1.0, 2.0, 9.0], [3.0, 9.0, 9.0]])
     known = np.array([[True, True, False], [True, False, False]])

@@ -116,3 +116,9 @@ def test_without_standard_deviations_there_is_no_such_array_or_colour(tmp_path: 
     assert report["expected_error"] is None
     assert report["trust_sentence"].startswith("The error is not estimated")
     assert "colours" not in report["artifacts"]["shapes.glb"], "nothing is painted where nothing is known"
+
+
+def test_numbers_that_json_lacks_are_null_in_every_precision() -> None:
+    metrics = {"one": np.float32("nan"), "two": np.float64("inf"), "three": np.float32(0.5)}
+    report = build_report(*make_result(), metrics=metrics)
+    assert report["metrics"] == {"one": None, "two": None, "three": 0.5}

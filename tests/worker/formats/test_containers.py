@@ -49,6 +49,16 @@ def test_matlab_structs_of_both_versions_give_the_same_tracks(tmp_path: Path) ->
         np.testing.assert_array_equal(read(tmp_path / name).tracks.points, POINTS)
 
 
+def test_other_variables_of_a_file_may_have_any_name_and_number(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "five.mat", {"W": MATRIX, "file": np.ones(3), "allow_pickle": np.ones(3)})
+    with h5py.File(tmp_path / "seven.mat", "w") as file:
+        file["Größe (mm)/W"] = MATRIX.T
+        for index in range(Limits().max_members):
+            file[f"v{index}"] = np.ones(3)
+    for name in ("five.mat", "seven.mat"):
+        np.testing.assert_array_equal(read(tmp_path / name).tracks.points, POINTS)
+
+
 def test_csv_lines_may_come_in_any_order_and_missing_ones_are_hidden(tmp_path: Path) -> None:
     lines = [f"{f},{p + 7},{x!r},{y!r}" for f in range(F) for p, (x, y) in enumerate(POINTS[f].tolist())]
     order = np.random.default_rng(0).permutation(len(lines))
@@ -83,6 +93,17 @@ def test_glb_and_mask_meshes_keep_the_order_of_vertices(tmp_path: Path) -> None:
     got = read_inputs(tracks=tmp_path / "t.npz", mesh=tmp_path / "m.png", options=Options())
     assert got.mesh is not None
     assert len(got.mesh.faces) == (ROWS - 1) * (COLUMNS - 1)
+
+
+def test_the_darkest_colours_of_a_mask_are_points(tmp_path: Path) -> None:
+    colours = np.array([[[0, 0, 0, 255], [1, 0, 0, 255], [0, 1, 0, 255]], [[0, 0, 1, 255], [9, 9, 9, 0], [0, 0, 0, 0]]])
+    expected = [[False, True, True], [True, False, False]]
+    Image.fromarray(colours.astype(np.uint8)).save(tmp_path / "m.png")
+    found = parse_in_sandbox("png", tmp_path / "m.png", field="mesh", limits=Limits())
+    np.testing.assert_array_equal(found["mask"], expected)
+    Image.fromarray(np.where(expected, 1, 0).astype(np.uint16)).save(tmp_path / "m.png")
+    found = parse_in_sandbox("png", tmp_path / "m.png", field="mesh", limits=Limits())
+    np.testing.assert_array_equal(found["mask"], expected)
 
 
 def test_hdf5_with_external_data_or_huge_declared_size_is_refused(tmp_path: Path) -> None:

@@ -111,6 +111,7 @@ def test_a_film_job_reads_the_file_as_a_tracks_job_does(tmp_path: Path) -> None:
         ({"fps": np.array([24.0, 25.0])}, "fps"),
         ({"uv": np.zeros((3, 2), np.float32)}, "texture coordinates"),
         ({"template_image": np.zeros((4, 4), np.uint8)}, "template_image"),
+        ({"template_image": np.zeros((1, 65_501, 3), np.uint8)}, "template_image"),  # too wide for a JPEG
     ],
 )
 def test_inconsistent_arrays_are_refused(tmp_path: Path, changed: dict[str, np.ndarray], got: str) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import inspect
 import os
+import signal
 import sys
+import tempfile
 from pathlib import Path
 
 import h5py
@@ -16,6 +18,7 @@ from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.worker.formats import AmbiguousInput, Limits, isolated_reader, read_inputs, save_inputs, store_inputs
 from pliant.worker.formats.isolated_reader import declared_bytes
+from pliant.worker.processes.contained import Ended
 from results import moving_sheet
 
 POINTS = moving_sheet(8, 6, 7)[..., :2] + 100
@@ -71,6 +74,39 @@ def test_exceeding_memory_or_time_is_an_input_error(all_apart: None, tmp_path: P
     with pytest.raises(InvalidInput, match=r"within 0\.01 s") as late:
         store_inputs(tracks=tmp_path / "t.npz", options=Options(), limits=Limits(read_seconds=0.01), target=None)
     assert late.value.code == "too_large"
+
+
+def test_a_small_file_that_expands_is_read_in_a_separate_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(isolated_reader, "LARGE", 64 << 10)
+    path = tmp_path / "t.csv"
+    corners = [(0, 0), (90, 0), (0, 90), (90, 90), (40, 50)]
+    lines = [
+        f"{frame},{point},{x + frame / 100},{y}"
+        for frame in (0, 400, 800, 1200)
+        for point, (x, y) in enumerate(corners)
+    ]
+    path.write_text("\n".join(["frame,point,x,y", *lines]))
+    assert declared_bytes(path, field="tracks") < isolated_reader.LARGE < 1201 * 5 * 16
+    here, read_here = [], isolated_reader.read_inputs
+    monkeypatch.setattr(isolated_reader, "read_inputs", lambda **parts: here.append(read_here(**parts)))
+    interpretation = store_inputs(tracks=path, mesh="none", options=Options(layout="frames_points"), target=None)
+    assert (interpretation.num_frames, interpretation.num_points) == (1201, 5)
+    assert not here
+
+
+def test_a_killed_reader_leaves_no_files(all_apart: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def killed(module: str, request: object, *, environment: dict[str, str], **more: object) -> Ended:
+        (Path(environment["TMPDIR"]) / "output").write_bytes(b"unfinished")
+        return Ended(-signal.SIGKILL, b"", "", overdue=True)
+
+    np.savez(tmp_path / "t.npz", tracks=POINTS)
+    monkeypatch.setattr(isolated_reader, "run_contained", killed)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(InvalidInput, match="are read within"):
+        store_inputs(tracks=tmp_path / "t.npz", options=Options(), target=None)
+    assert [path.name for path in tmp_path.iterdir()] == ["t.npz"]
 
 
 def test_an_internal_error_is_not_an_input_error(all_apart: None, tmp_path: Path) -> None:

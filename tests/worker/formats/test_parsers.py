@@ -22,6 +22,7 @@ from pliant.worker.formats.reading.meshes import read_obj, read_ply
 from pliant.worker.formats.reading.parsers import parse
 from pliant.worker.formats.reading.pose_hdf5 import read_hdf5
 from pliant.worker.formats.records import Arrays
+from pliant.worker.processes.contained import DONE, Ended
 
 FEW = Limits(max_points=2, max_faces=2, max_bytes=1000)
 BRIEF = Limits(max_bytes=64)
@@ -78,6 +79,22 @@ def test_a_parser_out_of_memory_refuses_the_file() -> None:
         raise MemoryError
 
     assert code(lambda: parse(hungry, io.BytesIO(), field="tracks", limits=Limits())) == "too_large"
+
+
+def test_arrays_above_the_limit_are_too_large_for_every_parser(tmp_path: Path) -> None:
+    lines = [f"{100 * row},0,1,2,1" for row in range(2001)]
+    (tmp_path / "t.csv").write_text("\n".join(["frame,point,x,y,visible", *lines]))
+    limits = Limits(max_bytes=200_001 * 16)  # enough for the positions, not for the visibility
+    read = lambda: sandbox.parse_in_sandbox("csv", tmp_path / "t.csv", field="tracks", limits=limits)  # noqa: E731
+    assert code(read) == "too_large"
+
+
+@pytest.mark.parametrize("answer", [b"{", b"3", b"[]", b'["a", "b"]', b"[" * 100_000])
+def test_a_sandbox_that_answers_other_names_than_it_wrote_is_refused(answer: bytes, tmp_path: Path) -> None:
+    np.savez(tmp_path / "output.npz", np.zeros(3))
+    ended = Ended(DONE, answer, "")
+    read = lambda: sandbox._received(ended, tmp_path / "output.npz", field="tracks", limits=Limits())  # noqa: E731
+    assert code(read) in ("damaged_file", "too_large")
 
 
 def test_sandboxed_formats_are_refused_without_a_sandbox(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

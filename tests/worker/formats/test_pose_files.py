@@ -95,6 +95,24 @@ def test_every_kind_of_table_is_read(case: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(read.tracks.points[seen], POINTS[seen])
 
 
+def test_points_without_a_confidence_count_as_seen(tmp_path: Path) -> None:
+    heads = [f"{name}_{axis}" for name in NAMES for axis in ("x", "y")]
+    rows = [",".join(f"{value:g}" for value in [*POINTS[frame].ravel(), SURE[frame, 2]]) for frame in range(F)]
+    (tmp_path / "tracks.csv").write_text("\n".join([",".join([*heads, f"{NAMES[2]}_likelihood"]), *rows]))
+    visible = read_inputs(tracks=tmp_path / "tracks.csv", mesh="none", options=Options()).tracks.visible
+    np.testing.assert_allclose(visible[:, 2], [0.9, 0, 0.9, 0.9, 0.9])
+    np.testing.assert_array_equal(np.delete(visible, 2, axis=1), 1)
+
+
+@pytest.mark.parametrize("name", ["visible", "likelihood", "Confidence"])
+def test_a_table_of_observations_may_have_a_confidence_of_any_name(name: str, tmp_path: Path) -> None:
+    places = [((f, p), x, y) for f in range(F) for p, (x, y) in enumerate(POINTS[f].tolist())]
+    rows = [f"{f},{p},{x},{y},{SURE[f, p]}" for (f, p), x, y in places]
+    (tmp_path / "tracks.csv").write_text("\n".join([f"frame,point,x,y,{name}", *rows]))
+    read = read_inputs(tracks=tmp_path / "tracks.csv", mesh="none", options=Options())
+    np.testing.assert_allclose(read.tracks.visible, np.where(SURE > 0.5, SURE, 0))
+
+
 @pytest.mark.parametrize(("mark", "encoding"), [(codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be")])
 def test_unicode_text_of_a_spreadsheet_is_read(mark: bytes, encoding: str, tmp_path: Path) -> None:
     text = one_row_a_frame("\t", ",").replace("\n", "\r\n")
@@ -153,7 +171,10 @@ def test_every_form_of_mediapipe_json_is_read(case: str, tmp_path: Path) -> None
     np.testing.assert_allclose(read.tracks.points[seen], (LANDMARKS * [640, 480])[seen])
 
 
-@pytest.mark.parametrize("nothing", [None, [], {"landmarks": []}, {"poseLandmarks": None}])
+NOTHING = [None, [], {"landmarks": []}, {"poseLandmarks": None}, {"landmarks": None, "world_landmarks": None}]
+
+
+@pytest.mark.parametrize("nothing", NOTHING)
 def test_a_mediapipe_frame_without_a_detection_is_hidden(nothing: object, tmp_path: Path) -> None:
     frames = [*MEDIAPIPE["lists"][:2], nothing, *MEDIAPIPE["lists"][3:]]
     (tmp_path / "pose.json").write_text(json.dumps(frames))
@@ -264,6 +285,7 @@ REFUSED: dict[str, tuple[bytes, str, str]] = {
         f"{UNKNOWN} a file of an unknown kind, which begins with the bytes ff fe 01 00 02 00 03 00. {CONVERT}",
     ),
     "words in a table": (b"frame,point,x,y\n0,0,1,2\n0,1,left,2\n", "unreadable_table", f"{TABLE} 3: '0,1,left,2'. {EXAMPLE}"),
+    "words below blank rows": (b",,,\n\nframe,point,x,y\n0,0,left,2\n", "unreadable_table", f"{TABLE} 4: '0,0,left,2'. {EXAMPLE}"),
     "other columns": (b"time,name,where,how\n1,2,3,4\n", "unreadable_table", f"{TABLE} 1: 'time,name,where,how'. {EXAMPLE}"),
     "decimal commas between commas": (b"frame,point,x,y\n0,0,1,5,2,5\n", "unreadable_table", f"{TABLE} 2: '0,0,1,5,2,5'. {EXAMPLE}"),
     "one row a frame without names": (

@@ -11,6 +11,7 @@ import numpy as np
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.formats.reading.pose_tables import (
+    CONFIDENCE,
     LONGEST_ROW,
     SEPARATORS,
     cells,
@@ -29,7 +30,6 @@ UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 codecs.lookup("utf-16")  # imports the decoder now: a contained process cannot open its module later
 
 COLUMNS = ("frame", "point", "x", "y")
-SEEN = ("visible", "visibility")
 WIDE = 8
 """Number of columns from which a table without names is rejected: its rows may be frames, and its columns could mean anything."""
 
@@ -73,7 +73,7 @@ def _read(lines: Iterator[str], *, field: str, limits: Limits) -> Arrays | tuple
     while first and not first.strip(SEPARATORS + " \r\n"):
         first, before = next(lines, ""), before + 1
     wide = _wide(first, lines, field=field, limits=limits, before=before)
-    return _columns(first, lines, field=field, limits=limits) if wide is None else wide
+    return _columns(first, lines, field=field, limits=limits, before=before) if wide is None else wide
 
 
 def _observations(columns: list[str], rows: list[list[float]], *, field: str, limits: Limits) -> Arrays:
@@ -107,7 +107,7 @@ def _observations(columns: list[str], rows: list[list[float]], *, field: str, li
     tracks = np.full((count * len(names), 2), np.nan)
     tracks[places] = table[:, [index["x"], index["y"]]]
     found: Arrays = {"tracks": tracks.reshape(count, len(names), 2)}
-    seen = next((index[name] for name in SEEN if name in index), None)
+    seen = next((index[name] for name in CONFIDENCE if name in index), None)
     if seen is not None:
         visible = np.zeros(count * len(names))
         visible[places] = table[:, seen]
@@ -134,18 +134,23 @@ def _wide(first: str, lines: Iterator[str], *, field: str, limits: Limits, befor
     )
 
 
-def _columns(first: str, lines: Iterator[str], *, field: str, limits: Limits) -> tuple[list[str], list[list[float]]]:
-    """Return the names of the columns and the numbers below them; a table without names has the default columns."""
+def _columns(
+    first: str, lines: Iterator[str], *, field: str, limits: Limits, before: int
+) -> tuple[list[str], list[list[float]]]:
+    """Return the names of the columns and the numbers below them; a table without names has the default columns.
+
+    `first` is line number `before` of the file.
+    """
     separator = separator_of(first)
     heads = split(first, separator)
     named = set(COLUMNS) <= set(heads)
     columns = heads if named else [*COLUMNS, "visible", *map(str, range(len(heads)))][: len(heads)]
     if len(heads) < len(COLUMNS) or (not named and len(heads) >= WIDE):
-        raise not_a_table(field, 1, first)
+        raise not_a_table(field, before, first)
     rows: list[list[float]] = []
-    for count, line in enumerate([] if named else [first], 1):
-        rows.append(_row(line, separator, len(columns), field=field, count=count))
-    for count, line in enumerate(lines, 2):
+    if not named:
+        rows.append(_row(first, separator, len(columns), field=field, count=before))
+    for count, line in enumerate(lines, before + 1):
         if not any(split(line, separator)):
             continue
         rows.append(_row(line, separator, len(columns), field=field, count=count))

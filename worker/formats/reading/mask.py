@@ -31,7 +31,7 @@ def read_png(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
                     expected=f"at most {MAX_PIXELS_A_POINT * limits.max_points:,} pixels",
                     got=f"{picture.width} × {picture.height}",
                 )
-            values = np.asarray(picture.convert("LA"))
+            values = np.asarray(picture.convert("RGBA"))  # not grey: dark colours would round to black
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise damaged(field, f"a PNG that cannot be read ({str(error)[:120]})") from error
-    return {"mask": (values[..., 0] > 0) & (values[..., 1] > 0)}
+    return {"mask": (values[..., :3] > 0).any(axis=2) & (values[..., 3] > 0)}

@@ -93,11 +93,15 @@ def recognise(head: bytes, field: str) -> str:
 
 
 def parse(parser: Callable[..., Arrays], stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
-    """Run a parser; a MemoryError becomes an input error, since the limits are sufficient for valid files."""
+    """Run a parser; arrays above the limit and a MemoryError become input errors, since the limits are sufficient for valid files."""
     try:
-        return parser(stream, field=field, limits=limits)
+        arrays = parser(stream, field=field, limits=limits)
     except MemoryError as error:
         raise too_large(field, expected="a file that fits into memory", got="one that does not") from error
+    size = sum(array.nbytes for array in arrays.values())
+    if size > limits.max_bytes:
+        raise too_large(field, expected=f"at most {limits.max_bytes:,} bytes of arrays", got=f"{size:,} bytes")
+    return arrays
 
 
 def unknown_format(field: str, head: bytes) -> InvalidInput:

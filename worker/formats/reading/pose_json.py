@@ -99,19 +99,14 @@ def _landmarks(frame: Any) -> list[Any] | None:
             value
             for name, value in frame.items()
             if name.lower().replace("_", "").endswith(("landmarks", "landmark", "keypoints"))
+            and "world" not in name.lower()  # world landmarks are in metres instead of picture coordinates
         ]
-        named = [value for value in named if not _of_the_world(frame, value)]
         if not named:
             return None
         return _landmarks(named[0])
     if not isinstance(frame, list):
         return None
     return _landmarks(frame[0]) if frame and isinstance(frame[0], list) else frame
-
-
-def _of_the_world(frame: dict[str, Any], value: Any) -> bool:
-    """Return whether a value holds world landmarks, which are in metres instead of picture coordinates."""
-    return any(one is value and "world" in name.lower() for name, one in frame.items())
 
 
 def _values(landmark: Any) -> tuple[float, float, float] | None:

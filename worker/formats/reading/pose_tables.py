@@ -28,8 +28,10 @@ LANDMARKS = frozenset((21, 33, 468, 478, 543))
 
 EXAMPLE = "Write it as in `frame,point,x,y` and then `0,0,312.5,200.1`, or one row a frame: `frame,nose_x,nose_y,chin_x,chin_y`."
 
-_CONFIDENCE = ("v", "vis", "visible", "visibility", "likelihood", "confidence", "conf", "score", "c", "p", "presence")
-_AXIS = "|".join(sorted(("x", "y", "z", *_CONFIDENCE), key=len, reverse=True))
+CONFIDENCE = ("v", "vis", "visible", "visibility", "likelihood", "confidence", "conf", "score", "c", "p", "presence")
+"""Names of a column with the confidence or visibility of a point."""
+
+_AXIS = "|".join(sorted(("x", "y", "z", *CONFIDENCE), key=len, reverse=True))
 _NAMED = re.compile(rf"(?P<point>.*[^ _.:-])[ _.:-]+(?P<axis>{_AXIS})")
 _NUMBERED = re.compile(rf"(?P<axis>{_AXIS})[ _.:-]?(?P<point>\d+)")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
@@ -94,7 +96,7 @@ def columns_of(heads: list[str]) -> Columns | None:
         low = head.lower()
         fits = _NUMBERED.fullmatch(low) or _NAMED.fullmatch(low)
         if fits is not None:
-            axis = "confidence" if fits["axis"] in _CONFIDENCE else fits["axis"]
+            axis = "confidence" if fits["axis"] in CONFIDENCE else fits["axis"]
             found.setdefault(fits["point"], {}).setdefault(axis, index)
             # Some letters get longer in lower case; the name then stays in lower case.
             spelled.setdefault(fits["point"], (head if len(head) == len(low) else low)[slice(*fits.span("point"))])
@@ -141,7 +143,7 @@ def read_rows(
     """Read the rows below the header, each of `width` cells; `before` lines were read already.
 
     Returns the tracks `(F, P, 2)` under the writer's name, NaN where a cell is empty, `likelihood (F, P)` if there are
-    confidences, and `point_names` if the points have names.
+    confidences, 1 for points without, and `point_names` if the points have names.
 
     Raises
     ------
@@ -149,8 +151,8 @@ def read_rows(
         Codes too_large, unreadable_table.
     """
     rows: list[list[float]] = []
-    seen = [each for each in columns.confidence if each is not None]
-    wanted = [*columns.x, *columns.y, *seen]
+    seen = {point: column for point, column in enumerate(columns.confidence) if column is not None}
+    wanted = [*columns.x, *columns.y, *seen.values()]
     for count, line in enumerate(lines, before + 1):
         if not line.strip():
             continue
@@ -168,6 +170,7 @@ def read_rows(
     points = len(columns.x)
     table = np.array(rows, dtype=np.float64).reshape(len(rows), len(wanted))
     found: Arrays = {columns.writer: np.stack([table[:, :points], table[:, points : 2 * points]], axis=2)}
-    if len(seen) == points:
-        found["likelihood"] = table[:, 2 * points :]
+    if seen:
+        found["likelihood"] = np.ones((len(rows), points))
+        found["likelihood"][:, list(seen)] = table[:, 2 * points :]
     return {**found, **found_names(columns.names)}

@@ -3,17 +3,18 @@
 Every format but plain .npy and .npz is parsed here. The process starts with two open files, the input and the output, and then gives up
 the right to open another descriptor (RLIMIT_NOFILE = 0), so a parser that is taken over reaches no other file and no network. Its
 memory, processor time and output size are limited; its environment and working directory are empty. It writes an npz, which the
-parent reads with the same checks as an uploaded npz, or an error as JSON.
+parent reads with the same checks as an uploaded npz, and the names of its arrays, which may be any text, as JSON; or an error as JSON.
 """
 
 from __future__ import annotations
 
 import codecs
+import json
 import os
 import signal
 import sys
 import tempfile
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any
@@ -34,8 +35,6 @@ def parse_in_sandbox(parser: str, path: Path, *, field: str, limits: Limits) -> 
     InvalidInput
         The parser's error; too_large above the memory limit, too_slow above the time limit, damaged_file after a crash.
     """
-    from pliant.worker.formats.reading.arrays import read_file
-
     if find_spec("resource") is None:  # Windows
         raise InvalidInput(
             "unsupported_feature", field=field, expected="a .npz or .npy file on this system",
@@ -46,7 +45,7 @@ def parse_in_sandbox(parser: str, path: Path, *, field: str, limits: Limits) -> 
         with path.open("rb") as given:
             ended = _run(parser, given, output, field=field, limits=limits, directory=empty)
         if ended.code == DONE:
-            return read_file(Path(output.name), field=field, limits=limits)
+            return _received(ended, Path(output.name), field=field, limits=limits)
     raise _fault(ended, field=field, limits=limits)
 
 
@@ -56,6 +55,20 @@ def _run(parser: str, given: IO[bytes], output: IO[bytes], *, field: str, limits
     return run_contained(
         MODULE, request, seconds=2 * limits.parse_seconds + 30, directory=directory, descriptors=descriptors
     )
+
+
+def _received(ended: Ended, output: Path, *, field: str, limits: Limits) -> Arrays:
+    """Return the arrays of the sandbox under the names that it answered."""
+    from pliant.worker.formats.reading.arrays import read_file
+
+    try:
+        names = [str(name) for name in json.loads(ended.answer)]
+    except (ValueError, TypeError, RecursionError):
+        names = []
+    arrays = read_file(output, field=field, limits=replace(limits, max_members=len(names)))
+    if len(arrays) != len(names):
+        raise damaged(field, "a file that its reader cannot process")
+    return dict(zip(names, arrays.values(), strict=True))
 
 
 def _fault(ended: Ended, *, field: str, limits: Limits) -> InvalidInput:
@@ -108,8 +121,8 @@ def _parse(request: dict[str, Any]) -> str:
             }
         )
         arrays = parse(read, source, field=request["field"], limits=limits)
-        np.savez(target, allow_pickle=False, **arrays)
-    return "{}"
+        np.savez(target, *arrays.values(), allow_pickle=False)
+    return json.dumps(list(arrays))
 
 
 if __name__ == "__main__":
