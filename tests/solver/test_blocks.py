@@ -159,6 +159,7 @@ def test_small_sequences_need_no_blocks() -> None:
 
 
 @pytest.mark.usefixtures("limited")
+@pytest.mark.slow
 def test_results_in_scratch_files_equal_those_in_memory(film: gallery.Sequence, tmp_path: Path) -> None:
     settings = Settings(max_reweightings=2)
     np.save(tmp_path / "tracks.npy", film.tracks.points)

@@ -76,6 +76,7 @@ def test_resection_recovers_fast_motion_that_interpolation_loses(
 
 
 @pytest.mark.usefixtures("limited")
+@pytest.mark.slow
 def test_hidden_points_and_outliers_are_predicted_in_every_frame(film: gallery.Sequence) -> None:
     spoiled, _ = gallery.corrupt_tracks(film.tracks, outliers=0.03, noise=0.0)
     visible = np.random.default_rng(0).random((FRAMES, 60)) > 0.2
@@ -111,6 +112,7 @@ def test_a_stop_returns_finite_shapes_for_every_frame(film: gallery.Sequence) ->
 
 
 @pytest.mark.usefixtures("limited")
+@pytest.mark.slow
 def test_unknown_scales_are_estimated_in_every_frame(film: gallery.Sequence) -> None:
     zoom = np.exp(0.2 * np.sin(np.arange(FRAMES) / 3))
     points = film.tracks.points * zoom[:, None, None]

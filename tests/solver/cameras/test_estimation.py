@@ -174,6 +174,7 @@ def test_corrections_are_carried_to_the_frames_between() -> None:
     assert degrees_apart(truth @ exponential(-drift), truth) > 3
 
 
+@pytest.mark.slow
 def test_candidates_of_a_long_film_are_extended_by_their_own_factorizations(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(multistart, "MULTISTART_FRAMES", 10)
     monkeypatch.setattr(estimation, "run_multistart", lambda _, entries, **__: (entries[0], entries))  # unrefined

@@ -230,6 +230,7 @@ def test_given_cameras_may_be_perspective(given_cameras: Solution) -> None:
     assert e3d_frame_scaled(found.shapes, SEEN) < 0.03
 
 
+@pytest.mark.slow
 def test_unknown_scales_barely_increase_the_error_under_perspective(given_cameras: Solution) -> None:
     cameras = KnownCamera.from_arrays(FACE.rotations, focal=FOCAL, principal_point=(639.5, 359.5))
     found = solve(pinhole(SEEN, FOCAL), cameras=cameras)

@@ -47,6 +47,7 @@ def test_implausibly_large_scale_changes_are_rejected(monkeypatch: pytest.Monkey
     assert "vary more than those of any camera" in found.choices.reasons["scales"]
 
 
+@pytest.mark.slow
 def test_scales_of_given_rotations_are_more_accurate_than_those_of_a_rigid_shape() -> None:
     film = gallery.face(24, 150, scale_change=0.1)
     rows = normalize(film.tracks).points.transpose(0, 2, 1).reshape(48, -1)

@@ -21,6 +21,7 @@ def search_of(tracks: Tracks) -> FocalSearch:
     return found
 
 
+@pytest.mark.slow
 def test_halves_of_a_rolled_sheet_agree() -> None:
     search = search_of(rolled().tracks)
     chosen = tried_at(search, FOCAL, None)

@@ -21,6 +21,7 @@ GIVEN = Settings(surface="isometric", focal=FOCAL, image_size=SIZE, order="film"
     ],
     ids=["row", "row and one", "diagonal"],
 )
+@pytest.mark.slow
 def test_a_frame_that_shows_only_a_line_does_not_degrade_the_others(shown: range) -> None:
     sheet = rolled(frames=6, side=7)
     visible = np.ones(sheet.tracks.visible.shape)
@@ -70,6 +71,7 @@ def test_copies_of_points_give_finite_noise_and_probabilities() -> None:
     assert np.isfinite(found.inlier_probability).all()
 
 
+@pytest.mark.slow
 def test_a_stop_while_the_surface_is_refined_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     refining, everywhere = [], surface._everywhere
     monkeypatch.setattr(surface, "_everywhere", lambda *given: refining.append(True) or everywhere(*given))

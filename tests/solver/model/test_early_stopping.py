@@ -56,6 +56,7 @@ def test_early_stopping_avoids_overfitting_the_given_points() -> None:
     [(30, 2, 1e-6), (2 * FRAMES, 12, 0.03), (MIN_JUDGED_POINTS - 1, 12, 0.03)],
     ids=["few modes are all there is", "as many points as image coordinates", "too few to deal out"],
 )
+@pytest.mark.slow
 def test_learning_runs_to_the_end_without_evidence_of_overfitting(points: int, modes: int, drift: float) -> None:
     found, whole, why = both(drawn(points, modes=modes, drift=drift))
     np.testing.assert_array_equal(found.over_frames(), whole.over_frames())

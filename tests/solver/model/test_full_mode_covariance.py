@@ -100,6 +100,7 @@ def test_identifiability_needs_many_points_few_modes_low_noise_few_frames() -> N
     assert not is_identifiable(covariance(frames=MAX_BASIS_FRAMES + 1, noise=1e-8), 10_000)
 
 
+@pytest.mark.slow
 def test_modes_along_different_axes_determine_the_cameras() -> None:
     """Noise-free shapes of low rank: the separable covariance leaves cameras where they start, this one finds them."""
     random = np.random.default_rng(2)

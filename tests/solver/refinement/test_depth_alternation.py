@@ -45,6 +45,7 @@ def rigid() -> tuple[np.ndarray, Perspective, np.ndarray]:
 
 
 @pytest.mark.parametrize("degrees", [0.0, 6.0])
+@pytest.mark.slow
 def test_a_new_factorization_corrects_cameras_that_are_off(
     rigid: tuple[np.ndarray, Perspective, np.ndarray], degrees: float
 ) -> None:

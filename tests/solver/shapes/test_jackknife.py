@@ -49,6 +49,7 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.square(values).mean()))
 
 
+@pytest.mark.slow
 def test_few_points_are_less_certain_than_many() -> None:
     few, many = (rms(learning_std(*seen(points), turning=True)) for points in (14, 200))
     assert 0 < many < 0.5 * few

@@ -79,6 +79,7 @@ def test_outliers_of_a_nearly_rigid_body_are_found() -> None:
     assert metrics.e3d_frame(found.shapes, still) < 0.02
 
 
+@pytest.mark.slow
 def test_a_prior_of_weight_zero_rejects_nothing() -> None:
     found = solve(OUTLIER_SHARE, cameras=CAMERAS, settings=Settings(temporal_weight=0))
     assert np.isfinite(found.shapes).all()
@@ -94,6 +95,7 @@ def test_a_stop_before_the_shapes_rejects_nothing() -> None:
     assert (found.weights > 0).all()
 
 
+@pytest.mark.slow
 def test_long_films_are_judged_in_windows_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """Distant frames hardly change a prediction, so windows suffice for long films."""
     cameras = estimate_cameras(OUTLIER_SHARE, CAMERAS, settings=Settings(order="film"))

@@ -85,6 +85,7 @@ def test_sparsely_observed_points_match_their_observations() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.slow
 def test_two_noisy_observations_from_one_side_keep_the_depth_bounded(seed: int) -> None:
     """They hardly determine depth: if points could be anywhere in the body, the error would be three times that without them."""
     noise = np.random.default_rng(seed).normal(size=MADE.tracks.points.shape) * 0.02 * np.abs(TRUE).max()
