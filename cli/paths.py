@@ -111,13 +111,13 @@ def installation(settings: Settings) -> None:
         )
 
 
-def output_file(path: Path | None, option: str, *, force: bool) -> None:
-    """Check that a file can be written, before starting the work that produces it.
+def output_file(path: Path | None, option: str, *, force: bool, others: Iterable[Path | None] = ()) -> None:
+    """Check that a file can be written, before starting the work that produces it. `others` are the command's other files.
 
     Raises
     ------
     BadArgument
-        The path is a folder or, without `force`, an existing file; or its folder is missing or not writable.
+        The path is a folder, a device, one of `others` or, without `force`, an existing file; or its folder is missing or not writable.
     """
     from pliant.client.errors import BadArgument
 
@@ -125,12 +125,27 @@ def output_file(path: Path | None, option: str, *, force: bool) -> None:
         return
     if path.is_dir():
         raise BadArgument(f"{option}: expected a file, got the folder {path}. Give a file in it.")
+    if path.exists() and not path.is_file():
+        raise BadArgument(f"{option}: expected a file, got {path}, a device or a pipe. Choose another name.")
     if not path.parent.is_dir():
         raise BadArgument(f"{option}: there is no folder {path.parent}. Create it, or choose another.")
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise BadArgument(f"{option}: the folder {path.parent} is not writable. Choose another folder.")
     if path.exists() and not force:
         raise BadArgument(f"{option}: {path} exists already. Choose another name, or replace it with --force.")
+    if any(other is not None and other.resolve() == path.resolve() for other in others):
+        raise BadArgument(f"{option}: {path} is also another file of this command. Choose another name.")
+
+
+@contextmanager
+def written_aside(path: Path) -> Iterator[Path]:
+    """Yield the path of a hidden file to write, and move it to `path` at the end; after an error `path` is unchanged."""
+    aside = path.with_name(f".{path.name}.part")
+    try:
+        yield aside
+        aside.replace(path)
+    finally:
+        aside.unlink(missing_ok=True)
 
 
 def made_folder(folder: Path, option: str) -> None:

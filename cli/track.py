@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from pliant.cli.paths import input_file, output_file
+from pliant.cli.paths import input_file, output_file, written_aside
 from pliant.cli.session import LINE_EVERY, Force, Json, one_numerical_thread
 from pliant.cli.show import err, out, print_json
 
@@ -51,8 +51,10 @@ def track(
     ctx.obj.json = as_json
     one_numerical_thread()
     input_file(region, "--region")
-    output_file(output, "--output", force=force)
-    output_file(preview, "--preview", force=force)
+    others = [film, region]
+    for path, name in ((output, "--output"), (preview, "--preview")):
+        output_file(path, name, force=force, others=others)
+        others.append(path)
     from pliant.tracking import track_film
 
     with _bars() as on_step:
@@ -60,9 +62,11 @@ def track(
             film, region=region, region_frame=region_frame, template_frame=template_frame, frames=frames,
             grid_step=grid_step, on_step=on_step,
         )  # fmt: skip
-    tracked.save_npz(output)
+    with written_aside(output) as aside:
+        tracked.save_npz(aside)
     if preview is not None:
-        preview.write_bytes(tracked.contact_sheet())
+        with written_aside(preview) as aside:
+            aside.write_bytes(tracked.contact_sheet())
     _show(tracked, output, as_json=as_json)
 
 
@@ -101,4 +105,6 @@ def _show(tracked: TrackedFilm, output: Path, *, as_json: bool) -> None:
         return
     for warning in tracked.warnings:
         err().print(f"[yellow]Warning:[/yellow] {warning}")
-    out().print(f"{output}: {points} points in {count} frames, visible in {tracked.visibility.mean():.0%}.")
+    out().print(
+        f"{output}: {points} points in {count} frames, visible in {tracked.visibility.mean():.0%}.", markup=False
+    )

@@ -25,14 +25,16 @@ def warnings_before(film: Film, found: Survey, start: int, stop: int, *, whole: 
             "No region was given, so everything in the picture is tracked, background included. Draw around the thing."
         )
     if found.cuts:
-        places = ", ".join(str(found.indices[cut]) for cut in found.cuts)
+        count, first = len(found.cuts), found.indices[found.cuts[0]]
+        cuts = f"a cut (at frame {first})" if count == 1 else f"{count} cuts (the first at frame {first})"
         notes.append(
-            f"The film has a cut (at frame {places}). Only frames {found.indices[start]} to {found.indices[stop - 1]} are "
-            "tracked. Film the thing in one take."
+            f"The film has {cuts}. Only frames {found.indices[start]} to {found.indices[stop - 1]} are tracked. "
+            "Film the thing in one take."
         )
     if found.broken_tail:
         notes.append(
-            f"The film states {film.stated_frames} frames but ends after {found.indices[-1] + 1}; its end is damaged or missing."
+            f"The film states {film.stated_frames} frames but ends after {found.indices[-1] + 1}: it was trimmed, or its end is "
+            "damaged or missing."
         )
     if stop - start < FEW_FRAMES:
         notes.append(f"Only {stop - start} frames are tracked. Film two seconds or more, while the thing turns.")

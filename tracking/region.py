@@ -37,7 +37,10 @@ def read_region(region: Region, size: tuple[int, int]) -> Bools:
     if isinstance(region, str | Path):
         mask = _from_picture(Path(region), size)
     else:
-        given = np.asarray(region)
+        try:
+            given = np.asarray(region)
+        except ValueError:
+            given = np.full((1, 2), np.nan)  # rows of several lengths
         polygon = given.ndim == 2 and given.shape[1] == 2 and given.dtype != bool and given.shape != size[::-1]
         mask = _from_polygon(given, size) if polygon else _from_array(given)
     if mask.shape != size[::-1]:

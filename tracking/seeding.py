@@ -50,7 +50,7 @@ def place(template: Grey, region: Bools, *, step: float, everywhere: bool = Fals
     least one face, and the share of the region's cells that have texture.
     """
     height, width = template.shape
-    x, y = (np.arange(step / 2, side - 1, step) for side in (width, height))
+    x, y = (np.arange(min(step, side) / 2, side - 1, step) for side in (width, height))
     plane = np.stack(np.meshgrid(x, y), axis=-1).astype(np.float32)
     column, row = np.round(plane).astype(int).transpose(2, 0, 1)
     inside = region[row, column]

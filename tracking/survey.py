@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.tracking.decoding.film import Film
 from pliant.tracking.errors import FilmError, TrackingStopped
-from pliant.tracking.flow import Grey
+from pliant.tracking.flow import Floats, Grey
 from pliant.tracking.frame_store import FrameStore
 from pliant.tracking.records import OnStep, TrackingStep
 
@@ -18,8 +18,9 @@ ENLARGED_TO, LARGEST_ENLARGEMENT = 480, 3.0
 """Small films are enlarged to this longest side in pixels, at most by this factor: DIS matches at half the resolution it is given. On
 rendered films of 160×120, enlarging three times halves the median error (.53 to .25 px)."""
 
-THUMBNAIL = 96
-"""Longest side of the thumbnails in which cuts are detected, pixels."""
+THUMBNAIL, LEAST_THUMBNAIL = 96, 32
+"""Longest and least side of the thumbnails in which cuts are detected, pixels. OpenCV's fast preset reads beyond smaller pictures: it
+compares patches of 8 pixels at a quarter of the size."""
 
 SAME_SHOT, CUT = 0.7, 0.4
 """Correlation of successive thumbnails after motion compensation: usually above the first value within a shot, below the second across a
@@ -48,8 +49,8 @@ class Survey:
     cuts: tuple[int, ...]
     """Rows at which a new shot begins."""
 
-    scale: float
-    """Pixels of the stored frames per pixel of the film."""
+    scale: Floats
+    """Pixels of the stored frames per pixel of the film, across and down, shape `(2,)`; both sides are rounded to whole pixels."""
 
     broken_tail: bool
     """Whether the film ends before its declared number of frames."""
@@ -94,8 +95,8 @@ def survey(
             hint="Film two seconds or more, while the thing turns.",
         )  # fmt: skip
     return Survey(
-        np.array(indices), np.array(times), np.array(sharpness), find_cuts(np.array(likeness)), scale,
-        _ends_early(film, indices[-1]),
+        np.array(indices), np.array(times), np.array(sharpness), find_cuts(np.array(likeness)),
+        (np.array(size) / film.size).astype(np.float32), _ends_early(film, indices[-1]),
     )  # fmt: skip
 
 
@@ -125,7 +126,7 @@ def sharpest(sharpness: NDArray[np.float64], start: int, stop: int) -> int:
 
 def _thumbnail(grey: Grey) -> Grey:
     factor = THUMBNAIL / max(grey.shape)
-    size = (max(16, round(grey.shape[1] * factor)), max(16, round(grey.shape[0] * factor)))
+    size = (max(LEAST_THUMBNAIL, round(grey.shape[1] * factor)), max(LEAST_THUMBNAIL, round(grey.shape[0] * factor)))
     return np.asarray(
         cv2.GaussianBlur(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), (0, 0), 1.0), dtype=np.uint8
     )

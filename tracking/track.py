@@ -24,7 +24,7 @@ from pliant.tracking.records import FilmInfo, Followed, OnStep, TrackedFilm, Tra
 from pliant.tracking.region import Region, read_region, transport
 from pliant.tracking.registration import Registration
 from pliant.tracking.seeding import default_step, keep, neighbours, place, quads
-from pliant.tracking.survey import Survey, sharpest, survey
+from pliant.tracking.survey import Survey, sharpest, survey, tracking_scale
 from pliant.tracking.trajectories import track_again
 
 LONGEST_SIDE = 960
@@ -120,7 +120,7 @@ def track_film(
         run = _Run(opened, store, pool, on_step or (lambda _: None), stop)
         mask = None if region is None else read_region(region, opened.size)
         found = survey(opened, store, longest_side=longest_side, on_step=run.on_step, should_stop=stop)
-        step = None if grid_step is None else grid_step * found.scale
+        step = None if grid_step is None else grid_step * tracking_scale(opened.size, longest_side)
         plan = _plan(run, found, mask, region_frame, template_frame)
         return _track(run, found, plan, step, whole=region is None)
 
@@ -160,6 +160,12 @@ def _carry(run: _Run, mask: Bools, origin: int, template: int) -> Bools:
     """Carry the region to the template, with points without texture too, because only the outline counts."""
     step = default_step(mask)
     seeds, _ = place(run.store.read(origin), mask, step=step, everywhere=True)
+    if len(seeds.points) == 0:
+        raise FilmError(
+            "region_lost", field="region", expected="a region that can be followed to the template",
+            got=f"one narrower than {2 * step:.0f} pixels of the tracker's frames",
+            hint="Draw a larger region, or draw it in the template frame itself (region_frame).",
+        )  # fmt: skip
     carried = transport(
         run.store.read, seeds, origin, template, pool=run.pool, on_step=run.on_step, should_stop=run.should_stop
     )
@@ -248,9 +254,9 @@ def _assemble(
     )
 
 
-def _in_film(points: Floats, scale: float) -> Floats:
-    """Convert positions from the tracker's frames, which are `scale` times as large, to the film's pixels."""
-    return (points + np.float32(0.5)) / np.float32(scale) - np.float32(0.5)
+def _in_film(points: Floats, scale: Floats) -> Floats:
+    """Convert positions from the tracker's frames, which are `scale` times as wide and high, to the film's pixels."""
+    return (points + np.float32(0.5)) / scale - np.float32(0.5)
 
 
 def _pictures(
@@ -274,10 +280,11 @@ def _pictures(
 
 
 def _nearest(found: Survey, frame: int, field: str) -> int:
-    """Return the row of the used frame nearest to a frame number."""
-    if not 0 <= frame <= found.indices[-1]:
+    """Return the row of the used frame nearest to a frame number, which may be that of a skipped frame after the last one used."""
+    last = int(2 * found.indices[-1] - found.indices[-2]) - 1
+    if not 0 <= frame <= last:
         raise FilmError(
-            "no_such_frame", field=field, expected=f"a frame number from 0 to {found.indices[-1]}", got=str(frame),
+            "no_such_frame", field=field, expected=f"a frame number from 0 to {last}", got=str(frame),
             hint="Frames are counted in the whole film from 0.",
         )  # fmt: skip
     return int(np.abs(found.indices - frame).argmin())

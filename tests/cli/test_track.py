@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import json
 import re
 from pathlib import Path
+from typing import IO
 
 import films
 import numpy as np
@@ -33,6 +35,39 @@ def test_a_film_becomes_tracks_and_a_preview(tmp_path: Path) -> None:
     ran = CliRunner().invoke(app, ["track", *files, "--frames", ":4", "--force"])
     assert "points in 4 frames" in ran.stdout
     assert "Only 4 frames" in ran.stderr
+
+
+def test_a_file_of_the_command_is_not_replaced_by_another(tmp_path: Path) -> None:
+    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72)))
+    before = film.read_bytes()
+    for given in (["-o", "tracks.npz", "--preview", "tracks.npz"], ["-o", "film.mkv", "--force"]):
+        files = [name if name.startswith("-") else str(tmp_path / name) for name in given]
+        ran = CliRunner().invoke(app, ["track", str(film), *files])
+        assert ran.exit_code == 3, ran.output
+        assert "is also another file of this command" in " ".join(ran.output.split())
+    assert [each.name for each in tmp_path.iterdir()] == ["film.mkv"]
+    assert film.read_bytes() == before
+
+
+def test_earlier_tracks_survive_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72)))
+    (tmp_path / "tracks.npz").write_bytes(b"earlier")
+
+    def full(stream: IO[bytes], **arrays: object) -> None:
+        stream.write(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    ran = CliRunner().invoke(app, ["track", str(film), "-o", str(tmp_path / "tracks.npz"), "--force"])
+    assert ran.exit_code == 3, ran.output
+    assert (tmp_path / "tracks.npz").read_bytes() == b"earlier"
+    assert {each.name for each in tmp_path.iterdir()} == {"film.mkv", "tracks.npz"}
+
+
+def test_names_with_brackets_are_printed_in_full(tmp_path: Path) -> None:
+    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72)))
+    ran = CliRunner().invoke(app, ["track", str(film), "-o", str(tmp_path / "tracks[final].npz")])
+    assert "tracks[final].npz: " in ran.stdout
 
 
 def test_progress_lines_are_printed_without_a_terminal(

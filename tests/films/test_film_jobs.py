@@ -27,7 +27,9 @@ from pliant.schemas.options import Options
 from pliant.service.routes.local_result import read_result
 from pliant.solver.errors import InvalidInput
 from pliant.tracking import open_film
+from pliant.tracking.advice import warnings_before
 from pliant.tracking.contact_sheet import small_jpeg
+from pliant.tracking.survey import Survey
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.film import reconstruct_film, solving_seconds
 from pliant.worker.execution.pace import MachinePace
@@ -145,6 +147,14 @@ def test_too_little_memory_or_time_is_an_input_error(film: Path, tmp_path: Path)
     late = refusal(FilmSource(film), bounds=FilmBounds(check_seconds=0.01))
     assert late.code == "too_slow"
     assert "longest_side" in late.hint
+
+
+def test_a_film_of_many_cuts_has_a_short_warning(film: Path) -> None:
+    rows = np.arange(3000)
+    found = Survey(rows, rows / 30, np.ones(3000), tuple(range(6, 3000, 6)), np.ones(2, np.float32), broken_tail=False)
+    warnings = tuple(warnings_before(open_film(film), found, 0, 6, whole=False, rough=1.0))
+    assert "The film has 499 cuts (the first at frame 6). Only frames 0 to 5 are tracked." in warnings[0]
+    assert Tracked(container="matroska", warnings=warnings).warnings == warnings
 
 
 def test_each_exit_of_the_film_process_maps_to_an_error() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from pliant.tracking import Film, FilmError, FilmLimits, open_film
+from pliant.tracking.decoding.film import PICTURE_RATE
 from pliant.tracking.decoding.pictures import readable
 
 PICTURES = films.textured_pictures(8)
@@ -58,6 +59,38 @@ def test_gif_frame_durations_are_kept(tmp_path: Path) -> None:
     assert frames[3].image.shape == (48, 64, 3)
     assert len(list(open_film(tmp_path / "film.gif", frames="1:6:2").frames())) == 3
     assert [frame.index for frame in open_film(tmp_path / "film.gif", frames=3).frames()] == [0, 3, 6]
+
+
+def test_the_rate_of_a_gif_comes_from_its_durations(tmp_path: Path) -> None:
+    first, *others = [Image.fromarray(picture).quantize(64) for picture in PICTURES]
+    first.save(tmp_path / "film.gif", save_all=True, append_images=others, duration=80)
+    assert open_film(tmp_path / "film.gif").fps == pytest.approx(12.5)
+    first.save(tmp_path / "single.gif")
+    assert open_film(tmp_path / "single.gif").fps == PICTURE_RATE
+
+
+def test_a_recording_without_a_rate_gets_that_of_its_times(tmp_path: Path) -> None:
+    path = films.write_film(tmp_path / "film.webm", films.textured_pictures(31), fps=30)
+    film = open_film(films.like_a_recording(path))
+    assert [round(step, 3) for step in np.diff([frame.time for frame in film.frames()])[:2]] == [0.044, 0.032]
+    assert film.fps == pytest.approx(30, rel=0.01), "not the 1000 ticks per second of the container's clock"
+    assert film.stated_frames == 0
+
+
+def test_pictures_of_16_bits_keep_their_contrast(tmp_path: Path) -> None:
+    grey = cv2.cvtColor(PICTURES[0], cv2.COLOR_RGB2GRAY)
+    cv2.imwrite(str(tmp_path / "1.png"), grey.astype(np.uint16) * 257)
+    np.testing.assert_array_equal(read(open_film(tmp_path))[0], np.repeat(grey[..., None], 3, axis=2))
+
+
+def test_a_zip_is_opened_once_for_all_its_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = films.zip_of(tmp_path / "film.zip", {f"{i}.png": films.png(p) for i, p in enumerate(PICTURES)})
+    film, opened = open_film(path), []
+    archive = zipfile.ZipFile
+    monkeypatch.setattr(zipfile, "ZipFile", lambda *given: opened.append(archive(*given)) or opened[-1])
+    assert len(read(film)) == 8
+    assert len(opened) == 1, "opening a zip takes time in proportion to its pictures"
+    assert opened[0].fp is None, "it is closed afterwards"
 
 
 def test_a_rotation_flag_is_applied(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zipfile
 from pathlib import Path
 
 import films
@@ -158,3 +159,23 @@ def test_a_broken_picture_is_named(tmp_path: Path) -> None:
     with pytest.raises(FilmError, match=r"2\.png"):
         list(open_film(path).frames())
     assert refused(films.zip_of(tmp_path / "none.zip", {"notes.txt": b"none"})) == "no_picture"
+
+
+def test_a_broken_picture_of_any_zip_compression_is_refused(tmp_path: Path) -> None:
+    for compression in (zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
+        path = films.zip_of(tmp_path / "film.zip", {"1.png": films.png(PICTURES[0])}, compression)
+        data = bytearray(path.read_bytes())
+        data[60:1000] = b"\xff" * 940
+        path.write_bytes(data)
+        assert refused(path) == "broken_picture"
+
+
+def test_a_picture_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    for number, picture in enumerate(PICTURES[:3]):
+        (tmp_path / f"{number}.png").write_bytes(films.png(picture))
+    frames = open_film(tmp_path).frames()
+    next(frames)
+    (tmp_path / "2.png").unlink()
+    with pytest.raises(FilmError, match=r"got 2\.png: No such file or directory") as caught:
+        list(frames)
+    assert caught.value.code == "unreadable_film"

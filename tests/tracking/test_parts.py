@@ -63,6 +63,7 @@ def test_regions_are_read_from_masks_polygons_and_files(tmp_path: Path) -> None:
         (np.ones((48, 64)), "wrong_region"),
         ([(0, 0), (1, 1)], "wrong_polygon"),
         ([(0, 0), (1, np.nan), (5, 5)], "wrong_polygon"),
+        ([(0, 0), (1,), (5, 5)], "wrong_polygon"),
         ("missing.png", "unreadable_region"),
         (Path(__file__), "unreadable_region"),
     ],
@@ -155,6 +156,11 @@ def test_grids_lose_points_without_a_face_and_keep_their_order() -> None:
     np.testing.assert_array_equal(np.sort(grid[grid >= 0]), np.arange(len(kept)))
     beside = neighbours(grid, len(kept))
     assert beside[grid[0, 2]].tolist() == [-1, grid[0, 3], -1, grid[1, 2]]
+
+
+def test_a_step_wider_than_the_picture_places_no_points() -> None:
+    image = grey(1)[0]
+    assert len(place(image, np.ones_like(image, bool), step=300)[0].points) == 0
 
 
 def test_the_store_returns_frames_in_any_order() -> None:

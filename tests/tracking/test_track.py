@@ -272,6 +272,30 @@ def test_uneven_frame_times_and_a_damaged_end_give_warnings(tmp_path: Path) -> N
     assert any("its end is damaged or missing" in note for note in tracked.warnings)
 
 
+def test_a_tiny_region_cannot_be_transferred(turning: tuple[Path, RenderedFilm]) -> None:
+    with pytest.raises(FilmError, match="Draw a larger region") as caught:
+        track_film(turning[0], region=[(40, 40), (41, 40), (41, 41)], template_frame=9)
+    assert caught.value.code == "region_lost"
+
+
+def test_a_frame_skipped_by_the_selection_stands_for_the_nearest_used_one(turning: tuple[Path, RenderedFilm]) -> None:
+    path, film = turning
+    tracked = track_film(path, region=film.region(15), region_frame=15, frames="::2", grid_step=3)
+    assert tracked.film.frame_indices[tracked.template] == 14
+
+
+def test_a_narrow_film_is_tracked_in_its_own_pixels(tmp_path: Path) -> None:
+    pictures = films.textured_pictures(
+        4, (1600, 20), step=4
+    )  # 960 × 12 pixels for the tracker, which takes at least 16
+    path = films.zip_of(tmp_path / "film.zip", {f"{i}.png": films.png(p) for i, p in enumerate(pictures)})
+    tracked = track_film(path)
+    assert tracked.uv.max() < 1
+    np.testing.assert_allclose(np.ptp(tracked.tracks[tracked.template], axis=0), [1590, 13], atol=7)
+    step = np.diff(tracked.tracks, axis=0)[tracked.visibility[1:] & tracked.visibility[:-1]]
+    np.testing.assert_allclose(np.median(step, axis=0), [4, 0], atol=0.2)
+
+
 def test_tracks_of_reduced_films_are_in_the_original_pixels(tmp_path: Path) -> None:
     pictures = [cv2.resize(p, (768, 576), interpolation=cv2.INTER_CUBIC) for p in films.textured_pictures(6, (96, 72))]
     path = films.write_film(tmp_path / "film.mkv", pictures)

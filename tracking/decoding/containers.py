@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, Literal
 
@@ -38,9 +39,15 @@ def recognise(path: Path) -> Container:
     """
     if path.is_dir():
         return "folder"
+    with openable(path), path.open("rb") as stream:
+        return _recognise_stream(stream, path.name)
+
+
+@contextmanager
+def openable(path: Path) -> Iterator[None]:
+    """Convert the system's errors on opening or reading a film, a folder or a picture of it to `FilmError`."""
     try:
-        with path.open("rb") as stream:
-            return _recognise_stream(stream, path.name)
+        yield
     except OSError as error:
         raise _refusal("unreadable_film", f"{path.name}: {error.strerror}", "Check the path.") from error
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 from collections.abc import Generator, Iterator
@@ -20,6 +21,13 @@ from pliant.tracking.errors import FilmError
 
 PICTURE_RATE = 30.0
 """Frames per second assumed for pictures, which have no timestamps."""
+
+RATES = (0.1, 1000.0)
+"""Minimum and maximum frames per second that are believed."""
+
+TIMED_FRAMES, SAME_RATE = 60, 0.05
+"""Frames whose times give the rate of a GIF and check that of a Matroska or WebM film, and the maximum share by which the two may differ.
+Films that browsers record state no rate; FFmpeg then guesses one, often that of the container's clock, 1000 a second."""
 
 WIDEST_PIXEL = 4.0
 """Maximum ratio of a pixel's sides; anamorphic and broadcast formats stay below 2."""
@@ -52,7 +60,7 @@ class Film:
     """Width and height in pixels, upright."""
 
     fps: float
-    """Frames per second according to the file; 30 for pictures."""
+    """Frames per second according to the file or, if it states none, the times of its first frames; 30 for pictures."""
 
     stated_frames: int
     """Number of frames according to the file, which may be wrong; 0 if it gives none."""
@@ -110,10 +118,10 @@ class Film:
                 if index >= start and (index - start) % step == 0:
                     yield Frame(index, time, image)
         elif self.container in ("zip", "folder"):
-            listed = (zip_pictures if self.container == "zip" else folder_pictures)(self.path, self.limits)
-            for index in range(len(listed))[start:stop:step]:
-                name, read = listed[index]
-                yield Frame(index, index / PICTURE_RATE, read_picture(read(), name, self.limits))
+            with (zip_pictures if self.container == "zip" else folder_pictures)(self.path, self.limits) as listed:
+                for index in range(len(listed))[start:stop:step]:
+                    name, read = listed[index]
+                    yield Frame(index, index / PICTURE_RATE, read_picture(read(), name, self.limits))
         else:
             for frame in _decode_video(self.path, self.fps, start, stop, step):
                 yield frame if self.pixel_aspect == 1 else self._stretched(frame)
@@ -167,13 +175,14 @@ class _Facts(TypedDict):
 
 def _facts(path: Path, container: Container, limits: FilmLimits) -> _Facts:
     if container == "gif":
-        height, width = next(gif_frames(path, limits))[1].shape[:2]
-        return _pictures((width, height), 0)
+        first = [(time, image.shape) for time, image in itertools.islice(gif_frames(path, limits), TIMED_FRAMES)]
+        height, width = first[0][1][:2]
+        return _pictures((width, height), 0, _rate([time for time, _ in first]))
     if container in ("zip", "folder"):
-        listed = (zip_pictures if container == "zip" else folder_pictures)(path, limits)
-        name, read = listed[0]
-        height, width = read_picture(read(), name, limits).shape[:2]
-        return _pictures(checked((width, height), name, limits), len(listed))
+        with (zip_pictures if container == "zip" else folder_pictures)(path, limits) as listed:
+            name, read = listed[0]
+            height, width = read_picture(read(), name, limits).shape[:2]
+            return _pictures(checked((width, height), name, limits), len(listed), PICTURE_RATE)
     capture = _open_capture(path)
     try:
         width, height = (int(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
@@ -183,17 +192,33 @@ def _facts(path: Path, container: Container, limits: FilmLimits) -> _Facts:
         stated = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         rotation = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360
         aspect = _pixel_aspect(capture, rotation, path)
+        size = checked(_square((width, height), aspect), path.name, limits)
+        if container == "matroska" or not RATES[0] <= rate <= RATES[1]:
+            timed = _rate(_first_times(capture))
+            if not abs(rate - timed) <= SAME_RATE * timed:
+                rate, stated = timed, 0  # the number of frames was computed from the rate
     finally:
         capture.release()
-    fps = rate if np.isfinite(rate) and 0.1 <= rate <= 1000 else PICTURE_RATE
     return _Facts(
-        size=checked(_square((width, height), aspect), path.name, limits), fps=fps,
-        stated_frames=int(stated) if 0 < stated < 1e9 else 0, rotation=rotation, pixel_aspect=aspect,
+        size=size, fps=rate, stated_frames=int(stated) if 0 < stated < 1e9 else 0, rotation=rotation, pixel_aspect=aspect,
     )  # fmt: skip
 
 
-def _pictures(size: tuple[int, int], count: int) -> _Facts:
-    return _Facts(size=size, fps=PICTURE_RATE, stated_frames=count, rotation=0, pixel_aspect=1.0)
+def _pictures(size: tuple[int, int], count: int, fps: float) -> _Facts:
+    return _Facts(size=size, fps=fps, stated_frames=count, rotation=0, pixel_aspect=1.0)
+
+
+def _first_times(capture: cv2.VideoCapture) -> list[float]:
+    times: list[float] = []
+    while len(times) < TIMED_FRAMES and capture.grab():
+        times.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
+    return times
+
+
+def _rate(times: list[float]) -> float:
+    """Return the mean rate of frames at `times` in seconds; that of pictures if the times do not grow."""
+    span = times[-1] - times[0] if times else 0.0
+    return min((len(times) - 1) / span, RATES[1]) if span > 0 else PICTURE_RATE
 
 
 def _pixel_aspect(capture: cv2.VideoCapture, rotation: int, path: Path) -> float:

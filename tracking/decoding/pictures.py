@@ -6,14 +6,15 @@ import io
 import re
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
+from pliant.tracking.decoding.containers import openable
 from pliant.tracking.decoding.limits import FilmLimits
 from pliant.tracking.errors import FilmError
 
@@ -27,6 +28,8 @@ LARGEST_DIRECTORY = 4 << 20
 
 Colour = NDArray[np.uint8]
 
+Listed = list[tuple[str, Callable[[], bytes]]]
+"""Names of pictures, each with a function that reads it."""
 
 NO_MEMORY = "Error -4 "
 """Start of zlib's message for Z_MEM_ERROR: `zlib.error` has no error number."""
@@ -34,15 +37,14 @@ NO_MEMORY = "Error -4 "
 
 @contextmanager
 def readable(name: str) -> Iterator[None]:
-    """Convert errors of Pillow, zipfile and zlib on broken files to `FilmError`, and zlib's lack of memory to `MemoryError`."""
+    """Convert errors of Pillow, zipfile and decompressors on broken files to `FilmError`, and zlib's lack of memory to `MemoryError`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `checked` applies the film's own limit
             yield
-    except FilmError:
+    except (FilmError, MemoryError):
         raise
-    except (OSError, SyntaxError, ValueError, EOFError, IndexError, zipfile.BadZipFile, Image.DecompressionBombError,
-            NotImplementedError, RuntimeError, OverflowError, zlib.error) as error:  # fmt: skip
+    except Exception as error:  # the decompressors' errors have no common class, and not every Python has all of them
         if str(error).startswith(NO_MEMORY):
             raise MemoryError(str(error)) from error
         raise FilmError(
@@ -67,7 +69,10 @@ def read_picture(data: bytes | Path, name: str, limits: FilmLimits) -> Colour:
     """
     with readable(name), Image.open(io.BytesIO(data) if isinstance(data, bytes) else data, formats=FORMATS) as picture:
         checked(picture.size, name, limits)
-        return np.asarray(ImageOps.exif_transpose(picture).convert("RGB"))
+        upright = ImageOps.exif_transpose(picture)
+        if upright.mode.startswith("I"):  # 16 bits of grey, which Pillow would clip to 8 bits instead of scaling them
+            upright = Image.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
+        return np.asarray(upright.convert("RGB"))
 
 
 def checked(size: tuple[int, int], name: str, limits: FilmLimits) -> tuple[int, int]:
@@ -107,24 +112,37 @@ def gif_frames(path: Path, limits: FilmLimits) -> Iterator[tuple[float, Colour]]
             index += 1
 
 
-def folder_pictures(path: Path, limits: FilmLimits) -> list[tuple[str, Callable[[], bytes]]]:
-    """List the pictures of a folder in natural order, each with a function that reads it.
+@contextmanager
+def folder_pictures(path: Path, limits: FilmLimits) -> Iterator[Listed]:
+    """List the pictures of a folder in natural order.
 
     Raises
     ------
     FilmError
-        No pictures, or more bytes than the limit.
+        Not readable, no pictures, or more bytes than the limit.
     """
-    files = sorted(
-        (file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file() and file.name[0] != "."),
-        key=lambda file: natural(file.name),
-    )
-    _check_list(path.name, len(files), sum(file.stat().st_size for file in files), limits)
-    return [(file.name, file.read_bytes) for file in files]
+    with openable(path):
+        files = sorted(
+            (
+                file
+                for file in path.iterdir()
+                if file.suffix.lower() in SUFFIXES and file.is_file() and file.name[0] != "."
+            ),
+            key=lambda file: natural(file.name),
+        )
+        size = sum(file.stat().st_size for file in files)
+    _check_list(path.name, len(files), size, limits)
+    yield [(file.name, partial(_read, file)) for file in files]
 
 
-def zip_pictures(path: Path, limits: FilmLimits) -> list[tuple[str, Callable[[], bytes]]]:
-    """List the pictures of a zip in natural order, each with a function that unpacks it.
+def _read(file: Path) -> bytes:
+    with openable(file):
+        return file.read_bytes()
+
+
+@contextmanager
+def zip_pictures(path: Path, limits: FilmLimits) -> Iterator[Listed]:
+    """List the pictures of a zip in natural order; they can be read inside the `with` block.
 
     Raises
     ------
@@ -133,20 +151,21 @@ def zip_pictures(path: Path, limits: FilmLimits) -> list[tuple[str, Callable[[],
     """
     with readable(path.name):
         _check_directory(path)
-        with zipfile.ZipFile(path) as archive:
-            entries = [
-                entry
-                for entry in archive.infolist()
-                if entry.filename.lower().endswith(SUFFIXES) and not re.search(r"(^|/)(\.|__MACOSX/)", entry.filename)
-            ]
-    entries.sort(key=lambda entry: natural(entry.filename))
-    _check_list(path.name, len(entries), sum(entry.file_size for entry in entries), limits)
-    return [(entry.filename, lambda entry=entry: _unpack(path, entry)) for entry in entries]  # type: ignore[misc]
+        archive = zipfile.ZipFile(path)
+    with archive:  # open throughout, because opening it again for every picture would parse its directory every time
+        entries = [
+            entry
+            for entry in archive.infolist()
+            if entry.filename.lower().endswith(SUFFIXES) and not re.search(r"(^|/)(\.|__MACOSX/)", entry.filename)
+        ]
+        entries.sort(key=lambda entry: natural(entry.filename))
+        _check_list(path.name, len(entries), sum(entry.file_size for entry in entries), limits)
+        yield [(entry.filename, partial(_unpack, archive, entry)) for entry in entries]
 
 
-def _unpack(path: Path, entry: zipfile.ZipInfo) -> bytes:
+def _unpack(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
     """Read one picture of a zip, at most as many bytes as its directory entry gives, which the limit covers."""
-    with readable(entry.filename), zipfile.ZipFile(path) as archive, archive.open(entry) as stream:
+    with readable(entry.filename), archive.open(entry) as stream:
         return stream.read(entry.file_size)
 
 

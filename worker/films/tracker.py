@@ -36,7 +36,7 @@ class FilmFacts(BaseModel):
     width: Annotated[int, Field(ge=1, le=10**5)]
     height: Annotated[int, Field(ge=1, le=10**5)]
     fps: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
-    """Frames per second of the selected frames, as stated in the file."""
+    """Frames per second of the selected frames, by the file or the times of its first frames."""
 
     stated_frames: Count
     """Number of frames as stated in the file; 0 if it is not stated."""

@@ -100,3 +100,31 @@ def with_uneven_times(path: Path, first: int) -> Path:
         data[at - 4 : at] = struct.pack(">I", struct.unpack(">I", data[at - 4 : at])[0] + 8)
     path.write_bytes(data)
     return path
+
+
+def like_a_recording(path: Path) -> Path:
+    """Make a WebM film like one that a browser records: uneven times, and no frame rate."""
+    data = bytearray(path.read_bytes())
+    pending = [(0, len(data))]
+    while pending:
+        place, end = pending.pop()
+        while place < end:
+            _, body = _vint(data, place)
+            size, content = _vint(data, body)
+            name, size = bytes(data[place:body]).hex(), size & ~(1 << 7 * (content - body))
+            if name in ("18538067", "1654ae6b", "ae", "1f43b675"):  # Segment, Tracks, TrackEntry, Cluster
+                pending.append((content, content + size))
+            elif name == "23e383":  # DefaultDuration, which becomes Void
+                data[place : place + 2] = bytes([0xEC, 0x80 | content + size - place - 2])
+            elif name == "a3":  # SimpleBlock, with its time in ms
+                time = struct.unpack(">h", data[content + 1 : content + 3])[0]
+                data[content + 1 : content + 3] = struct.pack(">h", time + time * 7 % 20)
+            place = content + size
+    path.write_bytes(data)
+    return path
+
+
+def _vint(data: bytearray, place: int) -> tuple[int, int]:
+    """Return an EBML number with its marker bit, and the place after it."""
+    end = place + 9 - data[place].bit_length()
+    return int.from_bytes(data[place:end], "big"), end
