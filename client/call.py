@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -20,7 +19,7 @@ REDIRECT_TIMEOUT = 5.0
 """The same for the object store that the service redirects to; shorter, because the service itself is the fallback."""
 
 SILENCE_TIMEOUT = 60.0
-"""Seconds without a byte after which a connection counts as lost; longer than the service delays any response."""
+"""Seconds without a byte after which a connection counts as lost, in addition to the delay that the call asks for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +37,8 @@ class Call:
     """Raw body from a file, which is also reopened for each attempt."""
     content: bytes | None = None
     """Short body, sent as it is."""
+    delay: float = 0.0
+    """Seconds for which the service may delay its response."""
     changes_nothing: bool = False
     """True for a POST that has no side effects or has them only once."""
 
@@ -88,10 +89,10 @@ def request_for(
         call.method,
         call.path,
         params=dict(call.params) or None,
-        headers=dict(call.headers),
+        headers=httpx.Headers(dict(call.headers), encoding="utf-8"),  # an Idempotency-Key may be any text
         files=files,
         content=call.content,
-        timeout=_limits(timeout),
+        timeout=_limits(timeout, delay=call.delay),
     )
 
 
@@ -130,6 +131,7 @@ class _Stream(httpx.SyncByteStream, httpx.AsyncByteStream):
             yield piece
 
 
-def _limits(timeout: float) -> httpx.Timeout:
-    finite = timeout if math.isfinite(timeout) else SILENCE_TIMEOUT
-    return httpx.Timeout(min(SILENCE_TIMEOUT, finite), connect=min(CONNECT_TIMEOUT, finite))
+def _limits(timeout: float, *, delay: float = 0.0) -> httpx.Timeout:
+    return httpx.Timeout(
+        min(SILENCE_TIMEOUT, timeout), read=min(SILENCE_TIMEOUT + delay, timeout), connect=min(CONNECT_TIMEOUT, timeout)
+    )

@@ -50,9 +50,19 @@ class WaitTimeout(PliantError, TimeoutError):
 
 
 class UnexpectedAnswer(PliantError):
-    """The answer is not from a Pliant service: a proxy's error page, for example."""
+    """The answer is not from a Pliant service: a proxy's error page or redirect, for example.
+
+    Attributes
+    ----------
+    status : int or None
+        The HTTP status code of an error or redirect.
+    """
 
     code = "unexpected_answer"
+
+    def __init__(self, sentence: str, *, status: int | None = None) -> None:
+        super().__init__(sentence)
+        self.status = status
 
 
 class CorruptDownload(PliantError):
@@ -176,18 +186,20 @@ BY_STATUS: Mapping[int, type[APIStatusError]] = {
 
 
 def error_from(status: int, headers: Mapping[str, str], body: bytes) -> APIStatusError | UnexpectedAnswer:
-    """Return the exception for a response with status 400 or above."""
+    """Return the exception for a response with status 300 or above."""
     media_type = headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type != PROBLEM_TYPE:
         start = body[:200].decode("utf-8", "replace").strip()
+        elsewhere = f" and a redirect to {headers['location'][:200]}" if "location" in headers else ""
         return UnexpectedAnswer(
-            f"Expected {PROBLEM_TYPE} with status {status}, got {media_type or 'no content type'}: {start!r}. "
-            "Check that the address is a Pliant service and that no proxy answers instead."
+            f"Expected {PROBLEM_TYPE} with status {status}, got {media_type or 'no content type'}: {start!r}{elsewhere}. "
+            "Check that the address is a Pliant service and that no proxy answers instead.",
+            status=status,
         )
     try:
         problem = Problem.model_validate_json(body)
     except ValidationError as fault:
-        return UnexpectedAnswer(f"The problem document with status {status} cannot be read: {fault}")
+        return UnexpectedAnswer(f"The problem document with status {status} cannot be read: {fault}", status=status)
     kind = BY_STATUS.get(status, ServiceFailed if status >= 500 else APIStatusError)
     return kind(problem, retry_after=seconds_of(headers.get("retry-after")))
 

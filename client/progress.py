@@ -89,11 +89,11 @@ def progress_bar(console: Console | None = None, *, line_every: float | None = N
 
     screen = console if console is not None else RichConsole(stderr=True)
     columns = (
-        TextColumn("{task.description:<10}"),
+        TextColumn("{task.description:<10}", markup=False),
         BarColumn(),
         TaskProgressColumn(),
         TimeElapsedColumn(),
-        TextColumn("[dim]{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", style="dim", markup=False),  # a file's name may contain brackets
     )
     with Bars(*columns, console=screen, disable=not screen.is_terminal) as bars:
         bar = Bar(bars)

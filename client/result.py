@@ -150,10 +150,11 @@ class Reconstruction:
 
 
 def copied(source: Path, path: Path | str) -> Path:
-    """Copy a downloaded file to `path`, creating folders as needed."""
+    """Copy a downloaded file to `path`, creating folders as needed; it may be there already."""
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(source, target)
+    if not target.exists() or not target.samefile(source):
+        shutil.copyfile(source, target)
     return target
 
 

@@ -10,7 +10,16 @@ from dataclasses import dataclass, field
 
 import httpx
 from pliant.client.call import Call
-from pliant.client.errors import APIStatusError, PliantError, ServiceFailed, TooManyRequests, Unreachable, WaitTimeout
+from pliant.client.errors import (
+    APIStatusError,
+    PliantError,
+    ServiceFailed,
+    TooManyRequests,
+    UnexpectedAnswer,
+    Unreachable,
+    WaitTimeout,
+)
+from pliant.client.multipart import OnBytes
 
 TEMPORARY = frozenset({502, 503, 504})
 """Statuses of a temporarily unavailable service, or of a proxy in front of it."""
@@ -94,6 +103,16 @@ class Attempts:
             )
         return left
 
+    def bounding(self, on_bytes: OnBytes | None) -> OnBytes:
+        """Return `on_bytes` as a callback that raises `WaitTimeout` once the deadline has passed, in the middle of a body."""
+
+        def report(done: int, total: int) -> None:
+            self.remaining()
+            if on_bytes is not None:
+                on_bytes(done, total)
+
+        return report
+
     def answered(self) -> None:
         """Record that the service responded."""
         self.contact.made = True
@@ -156,6 +175,8 @@ def may_repeat(call: Call, fault: Exception) -> bool:
         return True
     if not call.repeatable:
         return False
+    if isinstance(fault, UnexpectedAnswer):
+        return fault.status in TEMPORARY
     if isinstance(fault, ServiceFailed):
         return fault.status in TEMPORARY or fault.problem.retryable
     return isinstance(fault, httpx.TransportError)

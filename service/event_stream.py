@@ -87,6 +87,7 @@ class Followers:
                     return
                 if watcher.failure is not None:
                     raise watcher.failure
+                self._start_reader(jobs.records)  # it may have ended after a failure, just before this follower came
                 if not watcher.newer(last) and not await watcher.changed(heartbeat):
                     yield None
                 known = watcher.newer(last)

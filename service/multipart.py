@@ -117,7 +117,7 @@ async def batches(request: Request, *, max_bytes: int, stall_seconds: float) -> 
     Refusal
         413: the declared or actual size exceeds `max_bytes`; 408: no byte arrives for `stall_seconds`.
     ClientDisconnect
-        The body is incomplete; the bytes that have arrived are yielded first.
+        The body is incomplete. Then, and before a 408, the bytes that have arrived are yielded first.
     """
     declared = request.headers.get("content-length", "")
     if declared.isdigit() and int(declared) > max_bytes:
@@ -129,13 +129,13 @@ async def batches(request: Request, *, max_bytes: int, stall_seconds: float) -> 
         try:
             async with asyncio.timeout(stall_seconds):
                 piece = await anext(stream, None)
-        except TimeoutError:
-            detail = f"No byte of the body arrived for {stall_seconds:g} s. Send the request again."
-            raise Refusal(ProblemCode.BODY_STALLED, detail=detail) from None
-        except ClientDisconnect:
+        except (TimeoutError, ClientDisconnect) as error:
             if gathered:  # uploads keep the bytes that have arrived
                 yield b"".join(gathered)
-            raise
+            if isinstance(error, ClientDisconnect):
+                raise
+            detail = f"No byte of the body arrived for {stall_seconds:g} s. Send the request again."
+            raise Refusal(ProblemCode.BODY_STALLED, detail=detail) from None
         if piece is None:
             break
         total += len(piece)

@@ -237,10 +237,10 @@ class Records(ABC):
         """Write `after` if the stored version is still that of `before`; return whether it was written."""
 
     @abstractmethod
-    def delete(self, id: str, *, at: datetime) -> None:
+    def delete(self, stored: Stored, *, at: datetime) -> None:
         """Remove a record with its events, log and idempotency key, and mark its files for removal.
 
-        Nothing happens if there is no such record.
+        Nothing happens if it was removed already, even if a new job has its id.
         """
 
     @abstractmethod

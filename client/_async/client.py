@@ -222,10 +222,12 @@ class AsyncClient(AsyncConnection):
             As for `submit`; `problem.choices` lists the possible interpretations of an ambiguous file.
         """
         inputs = Inputs(tracks=tracks, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations)
+        exchange = self._exchange(timeout, "the inspection")
         with tempfile.TemporaryDirectory(prefix="pliant-inspect-") as folder:
-            form = await in_thread(partial(inputs.form, Path(folder), option_fields(options), on_upload))
+            report = exchange.attempts.bounding(on_upload)
+            form = await in_thread(partial(inputs.form, Path(folder), option_fields(options), report))
             call = Call(method="POST", path="/v1/inspect", form=form, changes_nothing=True)
-            return await self._exchange(timeout, "the inspection").record(call, Interpretation)
+            return await exchange.record(call, Interpretation)
 
     async def get(self, job: str, *, timeout: float | None = None) -> AsyncRemoteJob:
         """Return a job with its current record."""
@@ -377,17 +379,11 @@ class AsyncClient(AsyncConnection):
 
     async def revoke_share(self, job: str, share: str, *, timeout: float | None = None) -> None:
         """Revoke a share link by its id."""
-        call = Call(method="DELETE", path=f"{job_path(job)}/shares/{quote(share, safe='')}")
-        await self._exchange(timeout).answer(call)
+        await self._remove(f"{job_path(job)}/shares/{quote(share, safe='')}", timeout)
 
     async def delete(self, job: str, *, timeout: float | None = None) -> None:
         """Delete a finished job and its files."""
-        exchange = self._exchange(timeout)
-        try:
-            await exchange.answer(Call(method="DELETE", path=job_path(job)))
-        except NotFound:
-            if exchange.attempts.failures == 0:  # otherwise an earlier attempt deleted it, and the response was lost
-                raise
+        await self._remove(job_path(job), timeout)
 
     async def download(
         self,
@@ -424,6 +420,14 @@ class AsyncClient(AsyncConnection):
         """Return the state of each part of the service: queue, storage, workers."""
         parts: dict[str, Any] = await self._document("/readyz", timeout)
         return parts
+
+    async def _remove(self, path: str, timeout: float | None) -> None:
+        exchange = self._exchange(timeout)
+        try:
+            await exchange.answer(Call(method="DELETE", path=path))
+        except NotFound:
+            if exchange.attempts.failures == 0:  # otherwise an earlier attempt removed it, and the response was lost
+                raise
 
     async def _document(self, path: str, timeout: float | None) -> Any:
         _, body = await self._exchange(timeout).answer(Call(method="GET", path=path, headers={"Accept": JSON}))

@@ -46,7 +46,7 @@ async def submit(
         "priority": "" if priority == "normal" else priority,  # omitted for services without priorities
     }  # fmt: skip
     fields = option_fields(options) | {key: text for key, text in texts.items() if text != ""}
-    whole = await in_thread(partial(inputs.form, folder, fields, on_upload))
+    whole = await in_thread(partial(inputs.form, folder, fields, exchange.attempts.bounding(on_upload)))
     key = idempotency_key if idempotency_key is not None else secrets.token_urlsafe(16)
     for attempt in (1, 2, 3):
         form = await upload_large(exchange, whole, key if job_id is None else f"id:{job_id}")
@@ -84,7 +84,7 @@ async def wait(exchange: Exchange, job: str, *, on_progress: OnJob | None) -> Jo
     pause = retries.poll_interval / 4
     while True:
         seconds = max(1, int(min(retries.long_poll, exchange.attempts.remaining())))
-        call = Call(method="GET", path=path, headers={"Prefer": f"wait={seconds}"})
+        call = Call(method="GET", path=path, headers={"Prefer": f"wait={seconds}"}, delay=seconds)
         response, body = await exchange.answer(call)
         now = parse(Job, body, response.status_code)
         if now.status.final:

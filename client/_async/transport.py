@@ -42,7 +42,9 @@ class Exchange:
 
     @asynccontextmanager
     async def stream(self, call: Call) -> AsyncIterator[httpx.Response]:
-        """Send a call, with retries, until a response with a status below 400 begins; close that response at the end.
+        """Send a call, with retries, until a successful response begins; close that response at the end.
+
+        A redirect is an error, e.g. a proxy's from http to https, unless the call asks for one.
 
         Raises
         ------
@@ -122,7 +124,7 @@ class Exchange:
             fault: Exception
             try:
                 response = await self.send(call)
-                if response.status_code < 400:
+                if response.is_success or (response.status_code == 307 and "redirect" in call.params):
                     return response
                 fault = await refusal(response)
             except httpx.TransportError as lost:
@@ -131,7 +133,7 @@ class Exchange:
 
 
 async def refusal(response: httpx.Response) -> PliantError:
-    """Read a response with status 400 or above completely and return the corresponding error."""
+    """Read a response with status 300 or above completely and return the corresponding error."""
     try:
         body = await response.aread()
     finally:

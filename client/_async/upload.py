@@ -72,7 +72,7 @@ async def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str,
         fault: Exception
         try:
             response = await exchange.send(call)
-            if response.status_code < 400:
+            if response.is_success:
                 await response.aread()
                 await response.aclose()
                 attempts.succeeded()

@@ -223,10 +223,12 @@ class Client(Connection):
             As for `submit`; `problem.choices` lists the possible interpretations of an ambiguous file.
         """
         inputs = Inputs(tracks=tracks, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations)
+        exchange = self._exchange(timeout, "the inspection")
         with tempfile.TemporaryDirectory(prefix="pliant-inspect-") as folder:
-            form = in_place(partial(inputs.form, Path(folder), option_fields(options), on_upload))
+            report = exchange.attempts.bounding(on_upload)
+            form = in_place(partial(inputs.form, Path(folder), option_fields(options), report))
             call = Call(method="POST", path="/v1/inspect", form=form, changes_nothing=True)
-            return self._exchange(timeout, "the inspection").record(call, Interpretation)
+            return exchange.record(call, Interpretation)
 
     def get(self, job: str, *, timeout: float | None = None) -> RemoteJob:
         """Return a job with its current record."""
@@ -378,17 +380,11 @@ class Client(Connection):
 
     def revoke_share(self, job: str, share: str, *, timeout: float | None = None) -> None:
         """Revoke a share link by its id."""
-        call = Call(method="DELETE", path=f"{job_path(job)}/shares/{quote(share, safe='')}")
-        self._exchange(timeout).answer(call)
+        self._remove(f"{job_path(job)}/shares/{quote(share, safe='')}", timeout)
 
     def delete(self, job: str, *, timeout: float | None = None) -> None:
         """Delete a finished job and its files."""
-        exchange = self._exchange(timeout)
-        try:
-            exchange.answer(Call(method="DELETE", path=job_path(job)))
-        except NotFound:
-            if exchange.attempts.failures == 0:  # otherwise an earlier attempt deleted it, and the response was lost
-                raise
+        self._remove(job_path(job), timeout)
 
     def download(
         self,
@@ -425,6 +421,14 @@ class Client(Connection):
         """Return the state of each part of the service: queue, storage, workers."""
         parts: dict[str, Any] = self._document("/readyz", timeout)
         return parts
+
+    def _remove(self, path: str, timeout: float | None) -> None:
+        exchange = self._exchange(timeout)
+        try:
+            exchange.answer(Call(method="DELETE", path=path))
+        except NotFound:
+            if exchange.attempts.failures == 0:  # otherwise an earlier attempt removed it, and the response was lost
+                raise
 
     def _document(self, path: str, timeout: float | None) -> Any:
         _, body = self._exchange(timeout).answer(Call(method="GET", path=path, headers={"Accept": JSON}))

@@ -43,7 +43,9 @@ class Exchange:
 
     @contextmanager
     def stream(self, call: Call) -> Iterator[httpx.Response]:
-        """Send a call, with retries, until a response with a status below 400 begins; close that response at the end.
+        """Send a call, with retries, until a successful response begins; close that response at the end.
+
+        A redirect is an error, e.g. a proxy's from http to https, unless the call asks for one.
 
         Raises
         ------
@@ -123,7 +125,7 @@ class Exchange:
             fault: Exception
             try:
                 response = self.send(call)
-                if response.status_code < 400:
+                if response.is_success or (response.status_code == 307 and "redirect" in call.params):
                     return response
                 fault = refusal(response)
             except httpx.TransportError as lost:
@@ -132,7 +134,7 @@ class Exchange:
 
 
 def refusal(response: httpx.Response) -> PliantError:
-    """Read a response with status 400 or above completely and return the corresponding error."""
+    """Read a response with status 300 or above completely and return the corresponding error."""
     try:
         body = response.read()
     finally:

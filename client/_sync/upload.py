@@ -73,7 +73,7 @@ def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str, repor
         fault: Exception
         try:
             response = exchange.send(call)
-            if response.status_code < 400:
+            if response.is_success:
                 response.read()
                 response.close()
                 attempts.succeeded()

@@ -91,4 +91,7 @@ def _client(scope: Scope, token: Token | None) -> str:
         address = ipaddress.ip_address(host)
     except ValueError:
         return host
-    return str(ipaddress.ip_network((address, 64), strict=False)) if address.version == 6 else host
+    if isinstance(address, ipaddress.IPv4Address):
+        return host
+    mapped = address.ipv4_mapped  # all such addresses are in one /64 network
+    return str(mapped or ipaddress.ip_network((address, 64), strict=False))

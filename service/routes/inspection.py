@@ -8,10 +8,12 @@ import numpy as np
 from fastapi import APIRouter, Request
 from numpy.typing import NDArray
 from pliant.schemas.job import Inspection
+from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Bound, Core, MyUploads, Service
 from pliant.service.multipart import Form, receive_form
 from pliant.service.openapi import SUBMIT_BODY, problems
-from pliant.service.submission import form_rules, parse_options, read_form, with_uploads
+from pliant.service.problems import wrong_input
+from pliant.service.submission import KEPT, form_rules, parse_options, read_form, with_uploads
 from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.formats import Inputs, load_inputs
 from pliant.worker.formats.isolated_reader import LARGE
@@ -36,7 +38,8 @@ NOT_SEEN = -1
 async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUploads) -> Inspection:
     """Read the parts of a job as `POST /v1/jobs` would, and return the interpretation without creating a job.
 
-    Inputs that a submission would refuse are refused with the same problem, including `choices`. Nothing is stored.
+    Inputs that a submission would refuse are refused with the same problem, including `choices`. Nothing is stored. `inputs_of` is
+    refused: the interpretation of an earlier job's inputs is in its record.
     """
     rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
     with core.incoming.scratch() as folder:
@@ -46,6 +49,9 @@ async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUpload
 
 def interpret(form: Form, folder: Path, uploads: Uploads, core: Service) -> Inspection:
     """Read a form as for a job, and return the interpretation with a sample or a first frame. Blocks; call it on a thread."""
+    if form.texts.get(KEPT, "").strip():
+        hint = "Read the `interpretation` of that job's record instead."
+        raise wrong_input(ProblemCode.UNKNOWN_PART, field=KEPT, expected="files", got="an earlier job", hint=hint)
     whole, canonical = with_uploads(form, folder, uploads), folder / "canonical.npz"
     films = FilmBounds.of(core.jobs.settings, max_bytes=core.limits.max_bytes)
     options = parse_options(whole.texts.get("options", ""))

@@ -11,7 +11,6 @@ with `Upload-Offset` appends like PATCH, because it is idempotent and can be rep
 from __future__ import annotations
 
 import base64
-import binascii
 import re
 from dataclasses import dataclass
 from functools import partial
@@ -241,7 +240,7 @@ def _sha256(digest: str | None) -> str | None:
         return None
     try:
         value = base64.b64decode(found[1], validate=True)
-    except binascii.Error:
+    except ValueError:  # not base64, or not ASCII
         value = b""
     if len(value) != 32:
         expected, got, hint = "sha-256=:BASE64 of 32 bytes:", found[0][:80], "Encode the raw digest, or leave it out."

@@ -127,3 +127,9 @@ def test_corrupt_partial_downloads_are_replaced(tmp_path: Path) -> None:
         client.download(job, tmp_path, names=["shapes.npz"])
         assert (tmp_path / "shapes.npz").read_bytes() == data
         (tmp_path / "shapes.npz").unlink()
+
+
+def test_the_animation_can_be_saved_where_it_was_downloaded(tmp_path: Path) -> None:
+    with Client("http://pliant.test", transport=InMemoryService(), retries=QUICK) as client:
+        result = client.submit(POINTS).wait(folder=tmp_path, timeout=30)
+        assert result.save_glb(tmp_path / "shapes.glb").read_bytes()[:4] == b"glTF"

@@ -58,6 +58,14 @@ def test_progress_is_shown_on_terminals_only() -> None:
         assert ("sending" in screen.getvalue()) == terminal
 
 
+def test_brackets_in_a_file_name_are_shown_as_they_are() -> None:
+    screen = io.StringIO()
+    with progress_bar(Console(file=screen, force_terminal=True, width=200)) as bar:
+        bar.label = "take[/2] [red].npz"
+        bar.on_upload(5, 10)
+    assert bar.label in screen.getvalue()
+
+
 def test_progress_is_described() -> None:
     now = datetime.now(UTC)
     assert describe(Progress(stage="loading", fraction=0, updated_at=now)) == ""

@@ -75,7 +75,7 @@ def test_a_file_deleted_before_or_during_a_download_returns_410(
     monkeypatch.setattr("pliant.worker.store.blobs.Blobs.get", lambda *_: stored)
     answer = http.get(address)
     assert (answer.status_code, answer.json()["code"]) == (410, "artifact_gone")
-    running.jobs.records.delete(job.id, at=utc_now())
+    running.jobs.records.delete(running.jobs.records.get(job.id), at=utc_now())
     answer = http.get(address)
     assert (answer.status_code, answer.json()["code"]) == (404, "unknown_job")
 

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import aclosing
 from datetime import timedelta
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import cast
 
 import httpx
 import pytest
+from pliant.service import event_stream
 from pliant.service.event_stream import WOKEN_AT_ONCE, Followers, _Watcher, is_final
 from pliant.worker.errors import StoreUnavailable
 from pliant.worker.jobs.service import Jobs
@@ -90,6 +92,33 @@ def test_a_job_that_ends_between_reads_still_yields_its_final_event(running: Run
         return [event async for event in Followers().follow(cast(Jobs, Ending()), job.id, after=seen)]
 
     last = asyncio.run(followed())[-1]
+    assert last is not None
+    assert is_final(last)
+
+
+def test_a_follower_that_comes_while_the_reader_fails_still_gets_events(
+    running: Running, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = submit(http, name="follows")
+    seen = running.jobs.events(job.id)[-1].id
+
+    class Failing(event_stream._Reader):
+        """Has already told all followers that it fails when the next one comes, and then ends."""
+
+        def run(self) -> None:
+            monkeypatch.undo()
+            self.ended.wait(0.2)
+
+    monkeypatch.setattr(event_stream, "_Reader", Failing)
+
+    async def followed() -> Event | None:
+        stream = Followers().follow(running.jobs, job.id, after=seen, heartbeat=0.5)
+        async with aclosing(stream), asyncio.timeout(15):
+            assert await anext(stream) is None
+            await asyncio.to_thread(finish, running, job.id, b"result")
+            return [event async for event in stream][-1]
+
+    last = asyncio.run(followed())
     assert last is not None
     assert is_final(last)
 

@@ -128,11 +128,12 @@ def small(serve: Serve) -> Running:
     return serve(limits=Limits(max_bytes=100_000))
 
 
-REFUSED: dict[str, tuple[dict[str, str], bytes, int, str]] = {
+REFUSED: dict[str, tuple[dict[str, Any], bytes, int, str]] = {
     "too large": ({}, b"x" * 200_000, 413, "upload_too_large"),
     "length too large": ({"Upload-Complete": "?0", "Upload-Length": "200000"}, b"x", 413, "upload_too_large"),
     "other bytes": ({"Repr-Digest": repr_digest(b"y")}, b"x", 422, "digest_mismatch"),
     "odd digest": ({"Repr-Digest": "sha-256=:AAA:"}, b"x", 422, "invalid_digest"),
+    "foreign digest": ({"Repr-Digest": "sha-256=:é:".encode("latin-1")}, b"x", 422, "invalid_digest"),
     "short digest": ({"Repr-Digest": "sha-256=:AAAA:"}, b"x", 422, "invalid_digest"),
     "negative": ({"Upload-Offset": "-1"}, b"x", 422, "invalid_request"),
     "not a number": ({"Upload-Length": "many"}, b"x", 422, "invalid_request"),
@@ -165,7 +166,7 @@ def test_a_stalled_upload_ends_and_its_bytes_are_kept(serve: Serve) -> None:
     with begun(hasty.url, "/v1/uploads/stalled", declared=90_000, sent=b"x" * 1000) as connection:
         heard(connection, b'"body_stalled"')
     there = httpx.get(f"{hasty.url}/v1/uploads/stalled").json()
-    assert (there["complete"], there["length"]) == (False, 90_000)
+    assert (there["complete"], there["length"], there["offset"]) == (False, 90_000, 1000)
 
 
 def test_a_job_can_use_uploads_instead_of_form_parts(running: Running, http: httpx.Client) -> None:

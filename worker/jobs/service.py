@@ -187,7 +187,7 @@ class Jobs:
         stored = self.stored(id)
         if not stored.job.status.final:
             raise NotAllowedNow(id, stored.job.status, wanted="deleted", hint="Cancel it first.")
-        self.records.delete(id, at=self.clock())
+        self.records.delete(stored, at=self.clock())
         with suppress(StoreUnavailable):
             for attempt_id in {stored.inputs.split("/")[2], stored.attempt_id}:
                 self.blobs.delete(f"jobs/{id}/{attempt_id}/")

@@ -71,12 +71,14 @@ class MemoryRecords(Records):
             self._note(before, after)
             return True
 
-    def delete(self, id: str, *, at: datetime) -> None:
+    def delete(self, stored: Stored, *, at: datetime) -> None:
+        id = stored.job.id
         with self._lock:
-            gone = self._records.pop(id, None)
-            if gone is not None:
-                self._deleted[id] = at
-            if gone is not None and gone.key is not None:
+            if self.look(id, stored.attempt_id) is None:
+                return
+            gone = self._records.pop(id)
+            self._deleted[id] = at
+            if gone.key is not None:
                 self._keys.pop(gone.key, None)
             for kept in (self._beats, self._events, self._logs):
                 kept.pop(id, None)

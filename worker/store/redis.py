@@ -72,10 +72,11 @@ _FULL, _NO_SPACE = "!full", "!space"
 """Results of `_CREATE` when the owner's queue or the quota is full; ids never start with this character."""
 
 # ARGV: 1 prefix, 2 id, 3 version before, 4 version, 5 status, 6 attempt id, 7 bytes, 8 body, 9 event, 10 data, 11 cap,
-# 12 when the webhook is due ('': none), 13 … counters and their increments
+# 12 when the webhook is due ('': none), 13 … counters and their increments. A repetition after a lost reply succeeds, too.
 _REPLACE = """
 local at, job = ARGV[1], ARGV[1] .. 'job:' .. ARGV[2]
-local held = redis.call('HMGET', job, 'version', 'status', 'owner', 'sort', 'bytes')
+local held = redis.call('HMGET', job, 'version', 'status', 'owner', 'sort', 'bytes', 'body')
+if held[1] == ARGV[4] and held[6] == ARGV[8] then return 1 end
 if held[1] ~= ARGV[3] then return 0 end
 redis.call('HSET', job, 'version', ARGV[4], 'status', ARGV[5], 'token', ARGV[6], 'bytes', ARGV[7], 'body', ARGV[8])
 if held[2] ~= ARGV[5] then
@@ -92,11 +93,11 @@ for i = 13, #ARGV, 2 do redis.call('HINCRBYFLOAT', at .. 'tally', ARGV[i], ARGV[
 return 1
 """
 
-# ARGV: 1 prefix, 2 id, 3 milliseconds since 1970
+# ARGV: 1 prefix, 2 id, 3 milliseconds since 1970, 4 attempt id
 _DELETE = """
 local at, job = ARGV[1], ARGV[1] .. 'job:' .. ARGV[2]
-local held = redis.call('HMGET', job, 'status', 'owner', 'sort', 'bytes', 'key')
-if not held[1] then return 0 end
+local held = redis.call('HMGET', job, 'status', 'owner', 'sort', 'bytes', 'key', 'token')
+if held[6] ~= ARGV[4] then return 0 end
 redis.call('ZREM', at .. 'index:*:' .. held[1], held[3])
 redis.call('ZREM', at .. 'index:@' .. held[2] .. ':' .. held[1], held[3])
 redis.call('DECRBY', at .. 'used', held[4])
@@ -181,9 +182,9 @@ class RedisRecords(Records):
             )  # fmt: skip
         return bool(written)
 
-    def delete(self, id: str, *, at: datetime) -> None:
+    def delete(self, stored: Stored, *, at: datetime) -> None:
         with reachable():
-            self._delete(args=[self._at, id, milliseconds(at)])
+            self._delete(args=[self._at, stored.job.id, milliseconds(at), stored.attempt_id])
 
     def deleted(self) -> dict[str, datetime]:
         with reachable():

@@ -64,11 +64,11 @@ def _lock(folder: Path, *, make: bool, id: str) -> int:
 
 def content(folder: Path) -> Path | None:
     """Return the file with an upload's bytes, None if there is none."""
-    for _ in range(2):  # it may have been completed between the two checks
-        for path in folder.glob(f"{WHOLE}*"):
-            return path
-        if (folder / PART).exists():
-            return folder / PART
+    for _ in range(2):  # it may be completed, i.e. renamed, while the names are read
+        with suppress(FileNotFoundError):
+            found = [path for path in folder.iterdir() if path.name == PART or path.name.startswith(WHOLE)]
+            if found:
+                return max(found)
     return None
 
 

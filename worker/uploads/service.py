@@ -55,13 +55,12 @@ class Uploads:
             No upload has this id.
         """
         folder = self._folder(id)
-        file = content(folder)
-        try:
-            if file is None:
-                raise UnknownUpload(id)
-            held, length = file.stat(), declared_length(folder)
-        except FileNotFoundError:
-            raise UnknownUpload(id) from None
+        while (file := content(folder)) is not None:
+            with suppress(FileNotFoundError):  # it was completed, i.e. renamed, or removed meanwhile
+                held, length = file.stat(), declared_length(folder)
+                break
+        else:
+            raise UnknownUpload(id)
         whole = file.name.startswith(WHOLE)
         return Upload(
             id=id,
@@ -178,16 +177,15 @@ class Uploads:
 
     def findings(self, now: datetime) -> Iterator[str]:
         """Yield a sentence for each upload that is inconsistent or should have expired."""
+        late = timedelta(seconds=self.expiry) + LATE
         for folder in self.directory.glob("*/*"):
-            names = sorted(path.name for path in folder.iterdir())
-            contents = [name for name in names if name == PART or name.startswith(WHOLE)]
-            if len(contents) != 1 or not set(names) <= {*contents, LENGTH, RESERVED}:
-                yield f"Upload {folder.name} holds {', '.join(names) or 'nothing'}; expected exactly one file."
-                continue
-            file = folder / contents[0]
-            late = timedelta(seconds=self.expiry) + LATE
-            if self.expiry > 0 and _moment(file.stat().st_mtime) + late <= now:
-                yield f"Upload {folder.name} should have expired."
+            with suppress(FileNotFoundError):  # it was completed or removed meanwhile
+                names = sorted(path.name for path in folder.iterdir())
+                contents = [name for name in names if name == PART or name.startswith(WHOLE)]
+                if len(contents) != 1 or not set(names) <= {*contents, LENGTH, RESERVED}:
+                    yield f"Upload {folder.name} holds {', '.join(names) or 'nothing'}; expected exactly one file."
+                elif self.expiry > 0 and _moment((folder / contents[0]).stat().st_mtime) + late <= now:
+                    yield f"Upload {folder.name} should have expired."
 
     def _folder(self, id: str) -> Path:
         if not is_id(id):

@@ -18,9 +18,11 @@ RESERVED_FOR = 120.0
 COUNTING_WITHIN = 10.0
 """Seconds that one process may take to count and reserve space."""
 
-# KEYS: 1 the hash; ARGV: 1 field, 2 text before ('': none), 3 text after ('': none)
+# KEYS: 1 the hash; ARGV: 1 field, 2 text before ('': none), 3 text after ('': none). A repetition after a lost reply succeeds, too.
 _SWAP = """
-if (redis.call('HGET', KEYS[1], ARGV[1]) or '') ~= ARGV[2] then return 0 end
+local held = redis.call('HGET', KEYS[1], ARGV[1]) or ''
+if held == ARGV[3] then return 1 end
+if held ~= ARGV[2] then return 0 end
 if ARGV[3] == '' then redis.call('HDEL', KEYS[1], ARGV[1]) else redis.call('HSET', KEYS[1], ARGV[1], ARGV[3]) end
 return 1
 """

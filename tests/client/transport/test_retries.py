@@ -13,6 +13,7 @@ from pliant.client import (
     Client,
     InvalidRequest,
     NotAuthorized,
+    NotFound,
     RemoteJob,
     Retry,
     ServiceFailed,
@@ -108,6 +109,12 @@ def test_a_lost_response_to_a_submission_creates_one_job(clock: Clock) -> None:
     assert len(keys) == 1
     bodies = {request.content.split(b"\r\n", 1)[1][:40] for request in service.requests[:3]}
     assert len(bodies) == 1
+
+
+def test_an_idempotency_key_may_be_any_text(clock: Clock) -> None:
+    client = client_of(InMemoryService(), clock)
+    first, again, other = (client.submit(POINTS, idempotency_key=key) for key in ("Gänge 1", "Gänge 1", "歩行"))
+    assert first.id == again.id != other.id
 
 
 def test_a_call_that_may_have_been_carried_out_is_not_repeated(clock: Clock) -> None:
@@ -232,6 +239,76 @@ def test_a_deletion_with_a_lost_response_succeeds(clock: Clock) -> None:
     service.faults, service.after = [cut_off], True
     job.delete()
     assert list(client.list()) == []
+
+
+def test_a_revocation_with_a_lost_response_succeeds(clock: Clock) -> None:
+    service = Flaky()
+    client = client_of(service, clock)
+    job = client.submit(POINTS)
+    job.wait(timeout=9)
+    share = job.share()
+    service.faults, service.after = [cut_off], True
+    client.revoke_share(job.id, share.id)
+    assert client.shares(job.id) == []
+    with pytest.raises(NotFound):
+        client.revoke_share(job.id, share.id)
+
+
+def test_an_error_page_of_a_proxy_during_a_restart_is_retried(clock: Clock) -> None:
+    pages = [lambda request, status=status: httpx.Response(status, html="<h1>nginx</h1>") for status in (502, 503, 504)]
+    assert client_of(Flaky(*pages), clock).limits().max_page == 200
+    assert len(clock.pauses) == 3
+    with pytest.raises(UnexpectedAnswer, match="with status 502"):
+        client_of(Flaky(*pages[:1] * 99), clock).limits()
+    service = Flaky(pages[0])
+    with pytest.raises(UnexpectedAnswer):  # not idempotent: it may have been carried out
+        client_of(service, clock)._exchange(None).record(Call(method="POST", path="/v1/jobs/x/retry"), Job)
+    assert len(service.requests) == 1
+
+
+def test_a_redirect_is_not_taken_for_success(clock: Clock) -> None:
+    def to_tls(request: httpx.Request) -> httpx.Response:
+        return httpx.Response(308, headers={"location": f"https://pliant.test{request.url.path}"})
+
+    client = client_of(httpx.MockTransport(to_tls), clock)
+    for call in (
+        lambda: client.delete("a"),
+        lambda: client.revoke_share("a", "b"),
+        lambda: client.log("a"),
+        lambda: client.options(),
+        lambda: client.get("a"),
+    ):
+        with pytest.raises(UnexpectedAnswer, match=r"status 308.* redirect to https://pliant\.test/"):
+            call()
+
+
+def test_a_response_that_the_client_asked_to_delay_is_not_a_failure(clock: Clock) -> None:
+    service = InMemoryService()
+    client = client_of(service, clock, long_poll=60.0)
+    client.submit(POINTS).wait(timeout=1000)
+    (delayed,) = [request for request in service.requests if "prefer" in request.headers]
+    assert delayed.headers["prefer"] == "wait=60"
+    assert delayed.extensions["timeout"]["read"] > 100
+
+
+@pytest.mark.parametrize("large", [False, True], ids=["form", "ahead"])
+def test_the_timeout_of_a_submission_also_ends_a_slow_upload(
+    clock: Clock, large: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if large:
+        monkeypatch.setattr("pliant.client.multipart.RESUMABLE_BYTES", 100_000)
+        monkeypatch.setattr("pliant.client.multipart.SMALL", 10_000)
+    sent: list[int] = []
+
+    def slowly(done: int, total: int) -> None:
+        sent.append(done)
+        clock.now += 1
+        assert total > 4_000_000
+
+    client = client_of(InMemoryService(), clock)
+    with pytest.raises(WaitTimeout, match="passed during the submission"):
+        client.submit(np.zeros((5, 60_000, 2)), on_upload=slowly, timeout=3)
+    assert len(sent) == 3
 
 
 def test_a_response_of_another_server_is_an_error(clock: Clock) -> None:

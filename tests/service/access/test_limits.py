@@ -69,6 +69,7 @@ def test_clients_are_counted_by_ipv4_address_or_ipv6_network() -> None:
 
     assert who("10.0.0.1") != who("10.0.0.2")
     assert who("2001:db8::1") == who("2001:db8::ffff:1") != who("2001:db8:0:1::1")
+    assert who("::ffff:10.0.0.1") == who("10.0.0.1"), "as some proxies write it"
     assert who("testclient") == "testclient"
     assert _client({"client": None}, None) == ""
 

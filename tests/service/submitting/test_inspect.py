@@ -80,3 +80,10 @@ def test_inspection_and_submission_reject_the_same_inputs(running: Running, http
     assert (answer.status_code, answer.json()["code"]) == (status, code)
     assert answer.json() == submitted.json()
     assert running.left_on_disk == []
+
+
+def test_inspection_of_an_earlier_jobs_inputs_points_to_its_record(http: httpx.Client) -> None:
+    job = http.post("/v1/jobs", files=form(npz(tracks=POINTS))).json()["id"]
+    problem = http.post("/v1/inspect", files={"inputs_of": (None, job)}).json()
+    assert (problem["code"], problem["field"]) == ("unknown_part", "inputs_of")
+    assert "`interpretation` of that job's record" in problem["detail"]

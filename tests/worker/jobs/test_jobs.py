@@ -316,6 +316,22 @@ def test_a_new_job_with_the_id_of_one_being_deleted_keeps_its_files(
     assert blob_names(jobs) == [jobs.records.get("nightly").inputs]
 
 
+def test_a_late_deletion_keeps_a_new_job_with_the_same_id(
+    jobs: Jobs,
+    submit,  # type: ignore[no-untyped-def]
+    inputs_file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    old = finish(jobs, submit(id="nightly").id, inputs_file)
+    jobs.delete("nightly")
+    new = submit(id="nightly", name="the next night")
+    with monkeypatch.context() as late:
+        late.setattr(Jobs, "stored", lambda *_: old)  # this deletion has read the record before all that
+        jobs.delete("nightly")
+    assert jobs.get("nightly") == new
+    assert blob_names(jobs) == [jobs.records.get("nightly").inputs]
+
+
 def test_leftovers_of_a_lost_attempt_are_noted_for_the_reconciler(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
     id = submit().id
     finish(jobs, id, inputs_file)

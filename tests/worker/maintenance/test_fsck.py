@@ -100,7 +100,7 @@ def test_every_kind_of_inconsistency_is_found(jobs: Jobs, submit: Callable[[], S
     only("report.json should have 5 bytes and has 3000000")
     jobs.records.update(done.job.id, lambda held: held.model_copy(update={"prefix": "elsewhere/"}))
     assert len(findings(jobs, pause=0)) == 2
-    jobs.records.delete(done.job.id, at=NOW)
+    jobs.records.delete(done, at=NOW)
     jobs.records.forget_deleted(done.job.id)
     jobs.blobs.delete(f"jobs/{done.job.id}/")
 

@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pliant.worker import errors
+from pliant.worker.uploads.folder import content, taken
 from pliant.worker.uploads.service import MAX_UPLOADS, Capacity, Uploads
 
 CAPACITY = Capacity(max_bytes=1000)
@@ -299,3 +300,31 @@ def test_appending_does_not_reread_the_upload(uploads: Uploads, monkeypatch: pyt
     send(uploads, "slow", b"y", offset=9)
     assert read == [10]
     assert uploads.get("slow").sha256 == hashlib.sha256(b"x" * 9 + b"y").hexdigest()
+
+
+def test_an_upload_is_found_while_it_is_being_completed(uploads: Uploads, monkeypatch: pytest.MonkeyPatch) -> None:
+    send(uploads, "whole", b"1234", finish=False)
+
+    def completed_meanwhile(folder: Path) -> Path | None:
+        file = content(folder)
+        if file is not None and file.name == "part":
+            file.rename(file.with_name(f"whole-{'0' * 64}"))
+        return file
+
+    monkeypatch.setattr("pliant.worker.uploads.service.content", completed_meanwhile)
+    held = uploads.get("whole")
+    assert (held.complete, held.offset) == (True, 4)
+
+
+def test_an_upload_that_is_removed_meanwhile_neither_counts_nor_fails_the_count(
+    uploads: Uploads, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    send(uploads, "kept", b"1234")
+    gone = uploads.directory / "owner" / "gone"
+    listed = [*uploads.directory.glob("*/*"), gone]
+    with monkeypatch.context() as meanwhile:  # each was there when the folder was listed and when it was looked at
+        meanwhile.setattr(Path, "is_dir", lambda _: True)
+        assert taken(gone) == 0
+    monkeypatch.setattr(Path, "glob", lambda *_: iter(listed))
+    assert uploads.used() == 4
+    assert list(uploads.findings(now())) == []
