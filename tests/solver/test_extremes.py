@@ -19,7 +19,6 @@ ONE: dict[str, Any] = {"basis_size": 2}
 LONG = pytest.mark.long
 """For combinations whose parts other cases cover."""
 
-BOTH = pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
 KNOWN = pytest.mark.parametrize("cameras", [CAMERAS, pytest.param(None, marks=LONG)], ids=["known", "estimated"])
 
 
@@ -55,7 +54,7 @@ def hidden(frames: object = slice(None), points: object = slice(None)) -> np.nda
             cameras,
             method,
             id=f"{'mesh' if meshed else 'no mesh'}-{'known' if cameras else 'estimated'}-{method}",
-            marks=[LONG] if cameras is None and (method != "robust" or not meshed) else [],
+            marks=[LONG] if cameras is None else [],
         )
         for cameras in (CAMERAS, None)
         for meshed in (True, False)
@@ -102,7 +101,7 @@ def test_non_finite_positions_act_like_a_visibility_mask(cameras: KnownCamera | 
             cameras,
             method,
             id=f"{frames}-{'known' if cameras else 'estimated'}-{method}",
-            marks=[LONG] if cameras is None and (method != "robust" or len(frames) == 1) else [],
+            marks=[LONG] if cameras is None else [],
         )
         for cameras in (CAMERAS, None)
         for frames in ([5], [0], [11], [0, 1, 6, 7])
@@ -124,7 +123,7 @@ def test_hidden_frames_are_filled_in_except_by_the_pseudo_inverse(
 
 @pytest.mark.parametrize(
     ("meshed", "cameras"),
-    [(True, CAMERAS), (False, CAMERAS), (True, None), pytest.param(False, None, marks=LONG)],
+    [(True, CAMERAS), (False, CAMERAS), *(pytest.param(meshed, None, marks=LONG) for meshed in (True, False))],
     ids=["mesh-known", "no mesh-known", "mesh-estimated", "no mesh-estimated"],
 )
 def test_never_seen_points_follow_their_mesh_neighbours(cameras: KnownCamera | None, meshed: bool) -> None:
@@ -193,7 +192,7 @@ def test_a_grid_with_holes_and_islands_is_reconstructed(cameras: KnownCamera | N
     assert 0.005 < metrics.e3d_frame(found.shapes, made.shapes[:, kept]) < 0.08
 
 
-@BOTH
+@KNOWN
 def test_a_rigid_object_comes_out_rigid(cameras: KnownCamera | None) -> None:
     still = np.repeat(MADE.shapes[:1], 12, axis=0)
     points = MADE.scales[:, None, None] * (still @ MADE.rotations[:, :2].transpose(0, 2, 1))
@@ -203,7 +202,7 @@ def test_a_rigid_object_comes_out_rigid(cameras: KnownCamera | None) -> None:
     assert spread < 0.02
 
 
-@pytest.mark.parametrize("given", [{}, {"image_size": (640.0, 480.0), "focal": 700.0}])
+@pytest.mark.parametrize("given", [pytest.param({}, marks=LONG), {"image_size": (640.0, 480.0), "focal": 700.0}])
 def test_collinear_points_give_finite_shapes_but_no_good_verdict(given: dict[str, object]) -> None:
     """A line determines neither depth nor a surface, so the verdict must not be good."""
     along = np.linspace(-1, 1, 14)[None, :, None]

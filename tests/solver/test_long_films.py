@@ -61,6 +61,7 @@ def test_deformation_between_the_learned_frames_is_recovered(film: gallery.Seque
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("limited")
+@pytest.mark.long
 def test_resection_recovers_fast_motion_that_interpolation_loses(
     film: gallery.Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -91,6 +92,7 @@ def test_hidden_points_and_outliers_are_predicted_in_every_frame(film: gallery.S
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_perspective_is_corrected_in_every_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     learn_from(40, monkeypatch)
     film, focal, distance = gallery.talk(90, 60), 600.0, 600.0

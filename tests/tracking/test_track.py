@@ -33,7 +33,7 @@ def tracked(turning: tuple[Path, RenderedFilm]) -> TrackedFilm:
     [
         pytest.param("face", marks=[pytest.mark.slow, pytest.mark.long]),
         pytest.param("flag", marks=pytest.mark.slow),
-        pytest.param("sphere", marks=pytest.mark.slow),
+        pytest.param("sphere", marks=[pytest.mark.slow, pytest.mark.long]),
         pytest.param("occluded", marks=pytest.mark.slow),
     ],
 )

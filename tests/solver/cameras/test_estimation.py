@@ -98,7 +98,7 @@ def test_a_still_camera_is_reported() -> None:
     assert any("hardly turns" in sentence for sentence in found.warnings)
 
 
-@pytest.mark.parametrize(("frames", "points"), [(3, 4), (3, 60), (20, 4)])
+@pytest.mark.parametrize(("frames", "points"), [(3, 4), (3, 60), pytest.param(20, 4, marks=pytest.mark.long)])
 @pytest.mark.slow
 def test_the_smallest_inputs_give_rotations(frames: int, points: int) -> None:
     found = estimate_cameras(normalize(Tracks.from_arrays(view(RIGID[:points], turning(frames, 40)))), Settings())
@@ -107,6 +107,7 @@ def test_the_smallest_inputs_give_rotations(frames: int, points: int) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_bits_and_stopping_returns() -> None:
     normalized = normalize(Tracks.from_arrays(view(RIGID, CAMERA)))
     first, second = estimate_cameras(normalized, Settings()), estimate_cameras(normalized, Settings())

@@ -46,6 +46,7 @@ def test_hypotheses_are_distinct_cameras_of_plausible_depth() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_sheet_has_no_further_starts() -> None:
     found = estimate_cameras(normalize(gallery.flag(12, 150).tracks), Settings())
     assert not found.hypotheses

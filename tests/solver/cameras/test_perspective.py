@@ -171,6 +171,7 @@ def test_tracks_with_y_up_are_the_same_scene_in_other_axes(close: Solution) -> N
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_camera_distances_of_a_rigid_object_are_as_exact_as_its_shape() -> None:
     seen = in_camera(np.repeat(FACE.shapes[:1], 8, axis=0), FACE.rotations)
     away = np.exp(0.25 * np.sin(np.arange(8)))  # in units of the focal length

@@ -90,6 +90,7 @@ def test_a_rigid_solid_is_not_a_sheet_although_it_preserves_lengths() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_long_film_is_compared_at_a_fixed_number_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     compared: list[int] = []
 

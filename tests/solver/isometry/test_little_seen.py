@@ -16,7 +16,7 @@ GIVEN = Settings(surface="isometric", focal=FOCAL, image_size=SIZE, order="film"
     "shown",
     [
         range(7),
-        pytest.param(range(8), marks=pytest.mark.slow),
+        pytest.param(range(8), marks=pytest.mark.long),
         pytest.param(range(0, 49, 8), marks=[pytest.mark.slow, pytest.mark.long]),
     ],
     ids=["row", "row and one", "diagonal"],
@@ -66,6 +66,7 @@ def test_points_rarely_seen_together_are_not_taken_as_a_sheet(required: bool) ->
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_copies_of_points_give_finite_noise_and_probabilities() -> None:
     sheet = rolled(frames=6, side=5)
     found = solve(Tracks.from_arrays(np.repeat(sheet.tracks.points, 14, axis=1)), settings=GIVEN)
@@ -74,6 +75,7 @@ def test_copies_of_points_give_finite_noise_and_probabilities() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_stop_while_the_surface_is_refined_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     refining, everywhere = [], surface._everywhere
     monkeypatch.setattr(surface, "_everywhere", lambda *given: refining.append(True) or everywhere(*given))

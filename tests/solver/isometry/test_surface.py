@@ -72,7 +72,9 @@ def test_maximum_depth_satisfies_the_cones_and_approximates_the_sheet() -> None:
     assert maximum_depth(graph, should_stop=lambda: True) is None
 
 
-@pytest.mark.parametrize(("kind", "error"), [("cylinder", 0.015), pytest.param("cone", 0.08, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("kind", "error"), [("cylinder", 0.015), pytest.param("cone", 0.08, marks=[pytest.mark.slow, pytest.mark.long])]
+)
 def test_a_rolled_sheet_is_recovered_with_the_focal_length_known(kind: str, error: float) -> None:
     sheet = rolled(kind, **SMALL) if kind == "cylinder" else rolled(kind)
     # The cone's edges hardly determine the focal length, so isometry is not assumed unless it is required.
@@ -139,6 +141,7 @@ def test_isometry_is_not_tried_for_other_surfaces() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_shallow_face_without_perspective_is_not_taken_as_isometric() -> None:
     verdict = isometric_surface(gallery.face(6, 60).tracks)
     assert verdict.surface is None
@@ -146,6 +149,7 @@ def test_a_shallow_face_without_perspective_is_not_taken_as_isometric() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_pure_noise_gives_a_warning_and_finite_shapes() -> None:
     noise = Tracks.from_arrays(np.random.default_rng(0).uniform(0, 400, (4, 12, 2)))
     assert isometric_surface(noise).surface is None

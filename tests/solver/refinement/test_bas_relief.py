@@ -104,7 +104,7 @@ def test_a_head_that_turns_by_2_degrees_gets_a_plausible_depth() -> None:
     solution = solve(tracks, head.mesh)
     found = depth_of(solution.shapes, solution.camera.rotations)
     assert 0.5 < found / depth_of(head.shapes, head.rotations) < 2
-    assert "as of half a sphere" in solution.choices.reasons["depth_extent"]
+    assert "like that of half a sphere" in solution.choices.reasons["depth_extent"]
     assert solution.trust is not None
     assert solution.trust.verdict != "good"
     assert solution.trust.interval is None

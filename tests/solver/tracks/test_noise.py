@@ -113,7 +113,7 @@ def test_the_model_order_is_not_limited_without_noise_or_with_few_points() -> No
 
 
 @pytest.mark.parametrize("points", [40, pytest.param(400, marks=pytest.mark.long)])
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.long)])
 @pytest.mark.slow
 def test_the_default_has_lower_error_with_strong_noise_than_the_papers_prior(known: bool, points: int) -> None:
     face = gallery.face(60, points)
