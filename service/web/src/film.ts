@@ -11,7 +11,7 @@ const PICTURES: [RegExp, string][] = [
   [/\.bmp$/i, "image/bmp"],
 ];
 /** Timeout for decoding the first frame, milliseconds; after it, the browser is assumed unable to decode the film. */
-const PATIENCE = 15_000;
+const PATIENCE = 25_000;
 
 /** Return true for a media type or name of a film, and for a zip without arrays. */
 export function looksLikeFilm(file: File, entries: Entry[]): boolean {
