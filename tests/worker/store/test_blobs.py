@@ -149,7 +149,7 @@ def test_hanging_calls_end_at_their_time_limit_and_further_ones_fail_at_once() -
     began = time.monotonic()
     with pytest.raises(StoreUnavailable, match="too many requests"):
         calls.run(go_on.wait, seconds=10)
-    assert time.monotonic() - began < 0.7  # the hanging calls still hang
+    assert time.monotonic() - began < 0.1
     for each in hanging:
         each.join()
     go_on.set()
