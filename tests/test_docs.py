@@ -14,12 +14,15 @@ import shlex
 import subprocess
 import sys
 import textwrap
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from _pytest.mark.structures import ParameterSet
+from pliant.client import Client, NotAllowedNow, Status
 from pliant.solver.gallery import face
 
 ROOT = Path(__file__).parents[1]
@@ -133,6 +136,16 @@ def folder(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
     return tmp_path
 
 
+@pytest.fixture
+def service(service_url: str) -> Iterator[str]:
+    """Address of the service, whose jobs are cancelled after a page that does not wait for them."""
+    yield service_url
+    with Client(service_url) as client:
+        for job in client.list(statuses=[Status.QUEUED, Status.RUNNING]):
+            with suppress(NotAllowedNow):  # it has ended just now
+                job.cancel()
+
+
 @pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.place)
 def test_every_code_block_has_a_language(block: Block) -> None:
     assert block.language in RUN | READ | SHOWN, (
@@ -147,14 +160,14 @@ def test_every_code_block_has_a_language(block: Block) -> None:
 
 @pytest.mark.parametrize("document", pages("python"))
 @pytest.mark.slow
-def test_python_blocks_run(document: Path, service_url: str, folder: Path) -> None:
+def test_python_blocks_run(document: Path, service: str, folder: Path) -> None:
     blocks = [block for block in BLOCKS if block.document == document and block.language == "python" and not block.note]
     assert blocks
     lines: list[str] = []
     for block in blocks:  # padded to its own line, so that a traceback shows the document's
-        lines += [""] * (block.line - len(lines)) + small(block.text.replace(ADDRESS, service_url)).splitlines()
+        lines += [""] * (block.line - len(lines)) + small(block.text.replace(ADDRESS, service)).splitlines()
     runner = "import sys; exec(compile(sys.stdin.read(), sys.argv[1], 'exec'))"
-    ran = run([sys.executable, "-W", "error", "-c", runner, document.name], folder, service_url, given="\n".join(lines))
+    ran = run([sys.executable, "-W", "error", "-c", runner, document.name], folder, service, given="\n".join(lines))
     assert ran.returncode == 0, f"{document.name}:\n{ran.stderr}"
 
 
@@ -171,7 +184,7 @@ def test_the_readmes_first_program_is_five_lines() -> None:
 
 @pytest.mark.parametrize("document", pages("bash"))
 @pytest.mark.slow
-def test_shell_blocks_run(document: Path, service_url: str, folder: Path) -> None:
+def test_shell_blocks_run(document: Path, service: str, folder: Path) -> None:
     (folder / "examples").symlink_to(ROOT / "examples")
     for block in BLOCKS:
         if block.document != document or block.language != "bash" or block.note:
@@ -180,7 +193,7 @@ def test_shell_blocks_run(document: Path, service_url: str, folder: Path) -> Non
             if command.split()[0] in KNOWN_COMMANDS:
                 known(command, block)
                 continue
-            ran = run(["bash", "-ec", command.replace(ADDRESS, service_url)], folder, service_url)
+            ran = run(["bash", "-ec", command.replace(ADDRESS, service)], folder, service)
             assert ran.returncode == 0, f"{block.place}: {command}\n{ran.stdout}\n{ran.stderr}"
 
 

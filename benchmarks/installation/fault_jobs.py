@@ -217,7 +217,7 @@ def _in_stage(instance: Instance, stage: str) -> str:
             job = client.submit(face(80, 6000).tracks.points, mesh="none", options=SHORT, timeout=120)
         instance.acknowledged.append(job.id)
         return job.id
-    if stage == "reweight":
+    if stage in ("queued", "reweight"):
         return submitted(instance, options=LONG)
     return submitted(instance, frames=80, points=12_000, options=LARGE)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from pliant.solver.monitor import Monitor
-from pliant.solver.reconstruction.camera_choice import with_camera_choice
+from pliant.solver.reconstruction.camera_report import with_camera_choice
 from pliant.solver.reconstruction.solution import finish
 from pliant.solver.reconstruction.start import Start
 from pliant.solver.records import Step

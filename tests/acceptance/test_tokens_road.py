@@ -21,7 +21,7 @@ from browsing import Browsing, why_not
 from long_jobs import long_request
 from pliant.cli.demo import announced
 from pliant.cli.exits import Exit
-from pliant.client import AsyncClient, Client, NotAuthorized
+from pliant.client import AsyncClient, Client, NotAuthorized, NotFound
 from pliant.client.webhooks import new_secret, verified
 
 pytestmark = pytest.mark.slow
@@ -101,10 +101,9 @@ def test_the_command_line_requires_a_valid_token(url: str, first: dict[str, Any]
     assert sent.returncode == 0, sent.stderr
     seen = pliant("watch", "mine", "--url", url, "--json", token=first["token"])
     assert json.loads(seen.stdout)["status"] == "succeeded", seen.stderr
-    for wrong in ("", "nonsense"):
-        refused = pliant("status", "mine", "--url", url, token=wrong)
-        assert refused.returncode == Exit.NOT_NOW
-        assert "token" in refused.stderr
+    refused = pliant("status", "mine", "--url", url, token="nonsense")
+    assert refused.returncode == Exit.NOT_NOW
+    assert "token" in refused.stderr
 
 
 def test_the_webhook_of_a_job_is_signed_and_the_sdk_verifies_it(url: str, first: dict[str, Any], tracks: Path) -> None:
@@ -139,34 +138,32 @@ def test_the_webhook_of_a_job_is_signed_and_the_sdk_verifies_it(url: str, first:
     assert [each.name for each in job.artifacts]
 
 
-def test_tokens_are_created_and_revoked_while_the_service_runs(url: str, data: Path) -> None:
+def test_tokens_are_created_and_revoked_while_the_service_runs(
+    url: str, data: Path, first: dict[str, Any], tracks: Path
+) -> None:
     second = made(data, "second", "--scope", "read", "--expires", "1h")
     listed = pliant("token", "list", "--data", data)
     assert "second" in listed.stdout
     assert second["token"] not in listed.stdout
     assert second["token"].split("_", 2)[2] not in pliant("token", "list", "--data", data, "--json").stdout
-    assert pliant("status", "mine", "--url", url, token=second["token"]).returncode == Exit.NOT_FOUND
-    assert pliant("cancel", "mine", "--url", url, token=second["token"]).returncode == Exit.NOT_FOUND
-    assert pliant("token", "revoke", second["id"], "--data", data).returncode == 0
-    assert pliant("list", "--url", url, token=second["token"]).returncode == Exit.NOT_NOW
+    with Client(url, token=first["token"]) as owner, Client(url, token=second["token"]) as client:
+        job = owner.submit(tracks, options=QUICK)
+        assert list(client.list()) == []
+        with pytest.raises(NotFound):
+            client.get(job.id)
+        with pytest.raises(NotAuthorized, match="scope submit"):
+            client.cancel(job.id)
+        assert pliant("token", "revoke", second["id"], "--data", data).returncode == 0
+        with pytest.raises(NotAuthorized, match="token"):
+            list(client.list())
     assert pliant("token", "revoke", second["id"], "--data", data).returncode == Exit.NOT_FOUND
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["x", "--scope", "everything"], "read, submit, admin"),
-        (["x", "--expires", "soon"], "12h, 90d"),
-        (["  "], "printable characters"),
-    ],
-)
-def test_invalid_token_arguments_are_rejected_with_a_message(
-    url: str, data: Path, arguments: list[str], message: str
-) -> None:
+def test_an_invalid_token_name_is_rejected_with_a_message(url: str, data: Path) -> None:
     del url
-    ran = pliant("token", "create", *arguments, "--data", data)
+    ran = pliant("token", "create", "  ", "--data", data)
     assert ran.returncode == Exit.REFUSED
-    assert message in ran.stderr
+    assert "printable characters" in ran.stderr
 
 
 def test_both_clients_require_a_valid_token(url: str, first: dict[str, Any], tracks: Path) -> None:
@@ -193,10 +190,8 @@ def test_both_clients_require_a_valid_token(url: str, first: dict[str, Any], tra
 def test_the_page_asks_for_the_token_and_shows_its_jobs(url: str, first: dict[str, Any], tracks: Path) -> None:
     from playwright.sync_api import expect
 
-    named = ["--id", "paged", "--name", "seen in the page"]
-    sent = pliant("submit", tracks, *QUICKLY, *named, "--url", url, token=first["token"])
-    assert sent.returncode == 0, sent.stderr
-    assert pliant("watch", "paged", "--url", url, token=first["token"]).returncode == 0
+    with Client(url, token=first["token"]) as client:
+        client.submit(tracks, options=QUICK, job_id="paged", name="seen in the page").wait(timeout=60, load=False)
     with Browsing() as browser:
         page = browser.new_page()
         page.goto(f"{url}/#job=paged")

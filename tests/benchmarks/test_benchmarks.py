@@ -34,6 +34,20 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=240, check=False)
 
 
+@pytest.fixture
+def run_here(bench, monkeypatch, capsys):
+    """Return a function that runs the accuracy benchmark in this process and returns what it prints."""
+    monkeypatch.chdir(ROOT)
+
+    def ran(*arguments: object) -> str:
+        monkeypatch.setattr(sys, "argv", ["accuracy", *map(str, arguments)])
+        capsys.readouterr()
+        assert bench("accuracy.__main__").main() == 0
+        return capsys.readouterr().out
+
+    return ran
+
+
 def write_case(folder: Path) -> None:
     made = face(5, 120)
     folder.mkdir(parents=True)
@@ -43,21 +57,21 @@ def write_case(folder: Path) -> None:
     (folder / "about.json").write_text(json.dumps({"units": "pixels"}))
 
 
-def test_accuracy_runs_resume_without_remeasuring(tmp_path):
+def test_accuracy_runs_resume_without_remeasuring(tmp_path, run_here):
     write_case(tmp_path / "data" / "tiny")
     results = tmp_path / "cells.jsonl"
-    arguments = ("--data", tmp_path / "data", "--points", 60, "--methods", "pseudo_inverse,temporal", "--corruptions",
+    arguments = ("--data", tmp_path / "data", "--points", 40, "--methods", "pseudo_inverse,temporal", "--corruptions",
                  "clean,outliers 6", "--trials", 2, "--results", results)  # fmt: skip
     first = run(*arguments)
     assert first.returncode == 0, first.stderr
     rows = [json.loads(line) for line in results.read_text().splitlines()]
     assert len(rows) == 2 * 2 * (1 + 2)  # cameras × methods × (clean once, outliers twice)
-    assert {row["points"] for row in rows} == {60}
+    assert {row["points"] for row in rows} == {40}
     assert all(row["commit"] for row in rows)
-    assert "| tiny, 5 × 60 | outliers 6 % | 2 |" in first.stdout
+    assert "| tiny, 5 × 40 | outliers 6 % | 2 |" in first.stdout
     assert f"{len(rows)} cells, measured at {rows[0]['commit']}" in first.stdout
     summary = tmp_path / "summary.jsonl"
-    assert run(*arguments, "--tables", "--summary", summary).stdout == ""
+    assert run_here(*arguments, "--tables", "--summary", summary) == ""
     records = [json.loads(line) for line in summary.read_text().splitlines()]
     assert {record["metric"] for record in records} == set(rows[0]["metrics"])
     spoiled = [r for r in records if r["corruption"] != "clean" and r["metric"] == "e3d_frame"]
@@ -68,24 +82,23 @@ def test_accuracy_runs_resume_without_remeasuring(tmp_path):
     assert spoiled[0]["std"] == pytest.approx(np.std(errors, ddof=1))
     kept = results.read_text()
     results.write_text(kept[:-40])  # the last line was cut off by an interruption
-    again = run(*arguments)
-    assert again.returncode == 0, again.stderr
+    run_here(*arguments)
     lines = results.read_text().splitlines()
     assert lines[:-2] == kept.splitlines()[:-1]  # nothing else was remeasured
     remade, original = json.loads(lines[-1]), json.loads(kept.splitlines()[-1])
     assert remade["metrics"] == pytest.approx(original["metrics"])
 
 
-def test_results_of_another_commit_are_remeasured_only_on_request(tmp_path):
+def test_results_of_another_commit_are_remeasured_only_on_request(tmp_path, run_here):
     write_case(tmp_path / "data" / "tiny")
     results = tmp_path / "cells.jsonl"
     arguments = ("--data", tmp_path / "data", "--methods", "pseudo_inverse", "--cameras", "true", "--results", results)
-    assert run(*arguments).returncode == 0
+    run_here(*arguments)
     old = json.loads(results.read_text())
     results.write_text(json.dumps({**old, "commit": "0ld"}) + "\n")
-    assert "measured at 0ld" in run(*arguments).stdout
+    assert "measured at 0ld" in run_here(*arguments)
     assert len(results.read_text().splitlines()) == 1
-    again = run(*arguments, "--remeasure").stdout
+    again = run_here(*arguments, "--remeasure")
     assert f"1 cells, measured at {old['commit']}" in again
     assert len(results.read_text().splitlines()) == 2
 

@@ -182,7 +182,7 @@ def s3_away(hosts: Hosts, how: str) -> Iterator[None]:
 
 @pytest.mark.parametrize("how", [pytest.param("dropped", marks=pytest.mark.long), "refused"])
 def test_a_job_that_finishes_during_an_s3_outage_keeps_its_result(hosts: Hosts, how: str) -> None:
-    id = hosts.submit(reweightings=12)
+    id = hosts.submit(reweightings=4)
     hosts.host_of(id)
     with s3_away(hosts, how):
         hosts.until(lambda: hosts.get(id).get("progress", {})["stage"] == "exporting", "it has its result")
@@ -207,7 +207,7 @@ def test_a_job_that_finishes_during_an_s3_outage_keeps_its_result(hosts: Hosts, 
 
 
 def test_an_attempt_frozen_past_its_lease_writes_nothing_when_resumed(hosts: Hosts) -> None:
-    id = hosts.submit(reweightings=15)
+    id = hosts.submit(reweightings=4)
     host = hosts.host_of(id)
     hosts.signal(host, signal.SIGSTOP)
     times = moved(hosts, id, time.monotonic())

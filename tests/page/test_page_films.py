@@ -65,10 +65,10 @@ def films(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 @pytest.fixture
 def filming(page: Page, url: str, finished: str) -> Page:
     """The front page of a service that tracks films; its answers are prepared, and no job is created."""
-    page.add_init_script(f"({KEEP_SENT})()")
     page.route("**/v1/options", with_film_options)
     page.route("**/v1/inspect", lambda route: route.fulfill(json=film_record(url, finished)["interpretation"]))
     page.goto(url)
+    page.evaluate(KEEP_SENT)
     page.get_by_text("Drop a film here").wait_for()
     return page
 
@@ -342,10 +342,9 @@ NOTE = """() => {
 
 
 def test_users_who_opted_in_are_notified_when_the_job_ends(filming: Page, url: str, finished: str) -> None:
-    filming.add_init_script(f"({NOTE})()")
+    filming.evaluate(NOTE)
     record = film_record(url, finished)
     answer_with(filming, record)
-    filming.goto("about:blank")  # init scripts run only in documents that are loaded afterwards
     filming.goto(f"{url}/#job={finished}")
     filming.get_by_role("button", name="Notify me at the end").click()
     expect(filming.get_by_role("button", name="You will be notified")).to_be_disabled()

@@ -9,7 +9,7 @@ import httpx
 import pytest
 from browsing import differing_pixels, why_not
 from paging import DONE, until
-from playwright.sync_api import Page, Route, expect
+from playwright.sync_api import Page, Request, Route, expect
 
 pytestmark = [
     pytest.mark.chromium,
@@ -18,21 +18,35 @@ pytestmark = [
 
 
 @pytest.mark.usefixtures("front")
-def test_an_example_is_run_with_the_keyboard_only(page: Page) -> None:
-    def tab_to(name: str, most: int = 60) -> None:
+def test_an_example_is_run_with_the_keyboard_only(page: Page, url: str) -> None:
+    called = """() => {
+      const it = document.activeElement;
+      return it.labels?.[0]?.innerText || it.innerText || it.ariaLabel || "";
+    }"""
+
+    def tab_to(name: str, key: str = "Tab", most: int = 60) -> None:
         for _ in range(most):
-            page.keyboard.press("Tab")
-            if page.evaluate("document.activeElement?.textContent || document.activeElement?.ariaLabel") == name:
+            page.keyboard.press(key)
+            if page.evaluate(called).split("\n")[0].strip() == name:
                 return
-        pytest.fail(f"the Tab key does not reach {name!r}")
+        pytest.fail(f"the {key} key does not reach {name!r}")
 
     page.get_by_role("button", name="breathing sphere").wait_for()  # the examples are loaded from the service
     tab_to("breathing sphere")
     page.keyboard.press("Enter")
     expect(page.get_by_role("button", name="Reconstruct")).to_be_focused()
     expect(page.locator("[data-part=tracks]")).to_contain_text("tracks 30 × 500 × 2 float32")
+    tab_to("Advanced", "Shift+Tab")
+    page.keyboard.press("Enter")
+    tab_to("Method")
+    page.keyboard.type("pseudo")  # this method with a given number of shapes takes seconds
+    tab_to("Basis shapes")
+    page.keyboard.type("2")
+    tab_to("Reconstruct")
     page.keyboard.press("Enter")
     expect(page.get_by_role("heading", name="breathing sphere")).to_be_focused()
+    options = httpx.get(f"{url}/v1/jobs/{page.url.partition('job=')[2]}").json()["options"]
+    assert (options["method"], options["basis_size"]) == ("pseudo_inverse", 2)
     canvas = page.locator(".view canvas")
     canvas.wait_for(timeout=DONE)
     tab_to("Play")
@@ -49,7 +63,11 @@ def test_an_example_is_run_with_the_keyboard_only(page: Page) -> None:
 
 def test_no_request_leaves_the_host(page: Page, url: str, finished: str) -> None:
     asked: list[str] = []
-    page.context.on("request", lambda request: asked.append(request.url))
+
+    def note(request: Request) -> None:
+        asked.append(request.url)
+
+    page.context.on("request", note)
     for address in (f"#job={finished}", "docs"):
         answer = page.goto(f"{url}/{address}")
         if address == "docs":
@@ -57,6 +75,7 @@ def test_no_request_leaves_the_host(page: Page, url: str, finished: str) -> None
         page.wait_for_timeout(1500)
         assert answer is not None
         assert answer.headers["content-security-policy"].startswith("default-src 'self';")
+    page.context.remove_listener("request", note)
     assert len(asked) > 10
     assert [address for address in asked if not address.startswith(f"{url}/")] == []
 

@@ -138,11 +138,11 @@ def share(url: str, job: str, **body: int) -> tuple[str, datetime]:
 
 
 @pytest.mark.parametrize(
-    ("locale", "words"), [("en-GB", "%-d %B %Y at 15:00"), ("de-DE", "%-d. November %Y um 17:00"), ("en-US", "7:00 AM")]
+    ("locale", "words"), [("de-DE", "%-d. November %Y um 17:00"), ("en-US", "%B %-d, %Y at 7:00 AM")]
 )
 def test_share_link_expiry_is_in_local_time(browser: Browser, url: str, finished: str, locale: str, words: str) -> None:
     link, _ = share(url, finished, expires_in=86400)
-    zone = {"en-GB": "Europe/London", "de-DE": "Europe/Athens", "en-US": "America/Los_Angeles"}[locale]
+    zone = {"de-DE": "Europe/Athens", "en-US": "America/Los_Angeles"}[locale]
     page = visitor(browser, locale=locale, timezone_id=zone)
     page.route("**/shares", lambda route: route.fulfill(json=[{"id": "a", "expires_at": "2031-11-20T15:00:00Z"}]))
     page.goto(link)

@@ -104,7 +104,7 @@ def test_the_animation_stops_loops_or_reverses_at_its_end(page: Page, url: str, 
 @pytest.fixture(scope="module")
 def model(url: str, small: dict[str, bytes]) -> dict[str, Any]:
     """The record of a job with options and a name that needs quoting."""
-    options = {"method": "spatio_temporal", "fps": 12.5, "refine_rotations": False}
+    options = {"method": "temporal", "camera": "orthographic", "basis_size": 2, "fps": 12.5, "refine_rotations": False}
     files = {"tracks": small[TRACKS], "mesh": small["mesh.npz"], "ground_truth": small["truth.npz"]}
     sent = {"name": "it's a face", "options": json.dumps(options)}
     record: dict[str, Any] = httpx.post(f"{url}/v1/jobs", files=files, data=sent, timeout=60).json()

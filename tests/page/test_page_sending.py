@@ -93,7 +93,8 @@ def test_an_error_is_shown_with_the_services_message(page: Page, url: str) -> No
 def test_dropped_files_are_assigned_to_their_parts(page: Page, url: str, small: dict[str, bytes]) -> None:
     jobs = len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"])
     drop(page, small)
-    for part, name in (("tracks", TRACKS), ("mesh", "mesh.npz"), ("ground_truth", "truth.npz")):
+    assigned = {"tracks": TRACKS, "mesh": "mesh.npz", "rotations": "cameras.npz", "ground_truth": "truth.npz"}
+    for part, name in assigned.items():
         expect(page.locator(f"[data-part={part}]")).to_contain_text(name)
     expect(page.get_by_role("region", name="How your files are interpreted")).to_contain_text("10 frames of 300 points")
     page.get_by_role("button", name="Remove mesh").click()

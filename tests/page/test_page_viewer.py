@@ -41,6 +41,7 @@ def jobs(url: str) -> tuple[str, str]:
     ):
         tracks = packed(tracks=sequence.tracks.points, visibility=sequence.tracks.visible > 0)
         files = {"tracks": (TRACKS, tracks), "mesh": ("mesh.npz", packed(faces=sequence.mesh.faces))}
+        files["rotations"] = ("cameras.npz", packed(rotations=sequence.rotations))
         answer = httpx.post(f"{url}/v1/jobs", files=files, data={"name": name, "options": QUICK}, timeout=60)
         ids.append(str(answer.json()["id"]))
     for id in ids:

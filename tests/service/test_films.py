@@ -25,6 +25,7 @@ from pliant.worker.execution import attempt
 from serving import Running, tracks, until
 from typer.testing import CliRunner
 
+forked = pytest.mark.usefixtures("forked_readers")
 PICTURES = films.textured_pictures(10, (96, 72))
 QUICK = {
     "outputs": [],
@@ -86,12 +87,14 @@ def test_a_film_becomes_a_job_with_tracks_and_shapes(running: Running, http: htt
         assert held["tracks"].shape == (10, done.interpretation.num_points, 2)
 
 
+@forked
 def test_a_film_without_a_region_succeeds_with_a_warning(running: Running, http: httpx.Client, film: bytes) -> None:
     done = work(running, send(http, film, options=QUICK).id)
     assert done.status is Status.SUCCEEDED, done.error
     assert any("No region was given" in sentence for sentence in done.warnings)
 
 
+@forked
 def test_a_film_sent_as_upload_or_form_part_is_the_same_request(http: httpx.Client, film: bytes) -> None:
     for id, content in (("the-film", film), ("the-mask", mask())):
         assert http.put(f"/v1/uploads/{id}", content=content).is_success
@@ -105,6 +108,7 @@ def test_a_film_sent_as_upload_or_form_part_is_the_same_request(http: httpx.Clie
     assert put.status_code == 202, put.text
 
 
+@forked
 def test_inspection_reads_a_film_without_tracking_it(running: Running, http: httpx.Client, film: bytes) -> None:
     before = running.waiting
     answer = http.post("/v1/inspect", files=parts(film, region=mask()))
@@ -118,6 +122,7 @@ def test_inspection_reads_a_film_without_tracking_it(running: Running, http: htt
 KINDS = "an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures"
 
 
+@forked
 def test_film_errors_use_the_users_file_name(http: httpx.Client, film: bytes) -> None:
     """The form's file name without its folder; for an upload, which has no file name, the job's name."""
     sentence = f"film: expected {KINDS}, got {{}}, which is none of these. Convert it: ffmpeg -i FILM film.mp4"
@@ -152,6 +157,7 @@ BAD: dict[str, tuple[dict[str, object], str, str]] = {
 }
 
 
+@forked
 @pytest.mark.parametrize("case", BAD)
 def test_invalid_films_and_part_combinations_are_rejected(running: Running, http: httpx.Client, case: str) -> None:
     given, code, field = BAD[case]
@@ -170,6 +176,7 @@ def refused(running: Running, http: httpx.Client, files: dict[str, object], code
     assert running.waiting == before
 
 
+@forked
 def test_broken_films_invalid_regions_and_zip_bombs_are_rejected(
     running: Running, http: httpx.Client, film: bytes, tmp_path: Path
 ) -> None:
@@ -186,6 +193,7 @@ def test_broken_films_invalid_regions_and_zip_bombs_are_rejected(
     refused(running, http, parts(bomb.read_bytes()), "too_few_frames", "film")
 
 
+@forked
 def test_a_film_that_cannot_be_tracked_fails_its_job_with_a_remedy(
     running: Running, http: httpx.Client, tmp_path: Path
 ) -> None:
@@ -197,6 +205,7 @@ def test_a_film_that_cannot_be_tracked_fails_its_job_with_a_remedy(
     assert "pattern" in done.error.detail
 
 
+@forked
 def test_cancelling_stops_the_tracking(running: Running, http: httpx.Client, tmp_path: Path) -> None:
     long = films.write_film(tmp_path / "long.mkv", films.textured_pictures(150, (320, 240)))
     id = send(http, long.read_bytes(), options={"grid_step": 4}).id
@@ -216,6 +225,7 @@ def test_cancelling_stops_the_tracking(running: Running, http: httpx.Client, tmp
     assert done.artifacts == []
 
 
+@forked
 def test_client_and_command_line_send_films(running: Running, film: bytes, tmp_path: Path) -> None:
     path, region = tmp_path / "film.mp4", tmp_path / "mask.png"
     path.write_bytes(film)

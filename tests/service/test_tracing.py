@@ -42,7 +42,7 @@ def test_request_queue_and_solver_stages_share_one_trace(
 ) -> None:
     sequence = face(4, 60)
     form = {"tracks": ("tracks.npz", npz(tracks=sequence.tracks.points)), "mesh": (None, "none"),
-            "options": (None, '{"max_reweightings": 2, "outputs": []}')}  # fmt: skip
+            "options": (None, '{"prior": "smooth", "max_reweightings": 2, "outputs": []}')}  # fmt: skip
     answer = http.post("/v1/jobs", files=form, headers={"traceparent": INCOMING})
     assert answer.status_code == 202, answer.text
     id = answer.json()["id"]

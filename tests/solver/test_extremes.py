@@ -12,7 +12,9 @@ from pliant.solver.evaluation import metrics
 pytestmark = pytest.mark.slow
 
 METHODS = ("pseudo_inverse", "temporal", "spatio_temporal", "robust")
-MADE = gallery.face(12, 120, degrees=45, mesh="triangles")
+MADE = gallery.face(12, 60, degrees=45, mesh="triangles")
+INSIDE = [20, 37]
+"""Vertices inside the mesh."""
 CAMERAS = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
 ONE: dict[str, Any] = {"basis_size": 2}
 """One factorization: cameras are estimated in less time."""
@@ -62,7 +64,7 @@ def hidden(frames: object = slice(None), points: object = slice(None)) -> np.nda
     ],
 )
 def test_three_frames_of_four_points_are_solved(cameras: KnownCamera | None, method: str, meshed: bool) -> None:
-    tracks = Tracks.from_arrays(MADE.tracks.points[:3, [0, 20, 50, 110]])
+    tracks = Tracks.from_arrays(MADE.tracks.points[:3, [0, 10, 25, 55]])
     given = None if cameras is None else KnownCamera.from_arrays(MADE.rotations[:3], MADE.scales[:3])
     mesh = Mesh.from_faces([[0, 1, 2], [0, 2, 3]], 4) if meshed else None
     found = solve(tracks, mesh, cameras=given, settings=Settings(method=method, **ONE))  # type: ignore[arg-type]
@@ -104,7 +106,7 @@ def test_non_finite_positions_act_like_a_visibility_mask(cameras: KnownCamera | 
             marks=[LONG] if cameras is None else [],
         )
         for cameras in (CAMERAS, None)
-        for frames in ([5], [0], [11], [0, 1, 6, 7])
+        for frames in ([11], [0, 1, 6, 7])
         for method in METHODS
     ],
 )
@@ -128,12 +130,12 @@ def test_hidden_frames_are_filled_in_except_by_the_pseudo_inverse(
 )
 def test_never_seen_points_follow_their_mesh_neighbours(cameras: KnownCamera | None, meshed: bool) -> None:
     """A hidden point inside the mesh follows its neighbours; without a mesh it stays at the centre."""
-    inside = [40, 77]
+    inside = INSIDE
     tracks = Tracks.from_arrays(MADE.tracks.points, hidden(points=inside))
     found = solve(tracks, MADE.mesh if meshed else None, cameras=cameras, settings=Settings(**ONE))
     assert_finite(found)
     assert (found.weights[:, inside] == 0).all()
-    rest = np.delete(np.arange(120), inside)
+    rest = np.delete(np.arange(60), inside)
     assert metrics.e3d_frame(found.shapes[:, rest], MADE.shapes[:, rest]) < 0.1
     if meshed and cameras is not None:
         whole = solve(MADE.tracks, MADE.mesh, cameras=cameras)
@@ -153,11 +155,11 @@ def test_never_seen_points_follow_their_mesh_neighbours(cameras: KnownCamera | N
 )
 def test_isolated_vertices_and_separate_patches_are_reconstructed(cameras: KnownCamera | None, kind: str) -> None:
     """One vertex has no face and two patches are disconnected: only the temporal prior, not smoothing, reaches them."""
-    alone = 33
+    alone = INSIDE[0]
     faces = MADE.mesh.faces[~(MADE.mesh.faces == alone).any(axis=1)]
     x = MADE.shapes[0][:, 0]
     faces = faces[((x[faces] > 0).all(axis=1)) | ((x[faces] <= 0).all(axis=1))]
-    mesh = Mesh.from_faces(faces, 120)
+    mesh = Mesh.from_faces(faces, 60)
     found = solve(MADE.tracks, mesh, cameras=cameras, settings=Settings(laplacian=kind, **ONE))  # type: ignore[arg-type]
     assert_finite(found)
     assert 0.005 < metrics.e3d_frame(found.shapes, MADE.shapes) < 0.08
@@ -168,7 +170,7 @@ def test_isolated_vertices_and_separate_patches_are_reconstructed(cameras: Known
 
 def test_a_mesh_without_faces_equals_no_mesh() -> None:
     without = solve(MADE.tracks, cameras=CAMERAS)
-    empty = solve(MADE.tracks, Mesh.from_faces(np.zeros((0, 3), dtype=int), 120), cameras=CAMERAS)
+    empty = solve(MADE.tracks, Mesh.from_faces(np.zeros((0, 3), dtype=int), 60), cameras=CAMERAS)
     np.testing.assert_array_equal(empty.shapes, without.shapes)
 
 
@@ -205,8 +207,8 @@ def test_a_rigid_object_comes_out_rigid(cameras: KnownCamera | None) -> None:
 @pytest.mark.parametrize("given", [pytest.param({}, marks=LONG), {"image_size": (640.0, 480.0), "focal": 700.0}])
 def test_collinear_points_give_finite_shapes_but_no_good_verdict(given: dict[str, object]) -> None:
     """A line determines neither depth nor a surface, so the verdict must not be good."""
-    along = np.linspace(-1, 1, 14)[None, :, None]
-    angle = np.linspace(0.2, 1.0, 7)[:, None, None]
+    along = np.linspace(-1, 1, 9)[None, :, None]
+    angle = np.linspace(0.2, 1.0, 4)[:, None, None]
     line = np.concatenate([along * np.cos(angle), along * np.sin(angle)], axis=2)
     found = solve(Tracks.from_arrays(320 + 150 * line), settings=Settings(max_reweightings=5, **ONE, **given))  # type: ignore[arg-type]
     assert np.isfinite(found.shapes).all()

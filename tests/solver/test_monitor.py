@@ -55,7 +55,7 @@ def stopped_at(tracks: Tracks, settings: Settings, number: int, cameras: KnownCa
 
 
 def test_a_stop_during_the_smooth_prior_is_reported() -> None:
-    tracks, settings = small(), Settings(prior="smooth", refine_rotations=False)
+    tracks, settings = small(), Settings(prior="smooth", refine_rotations=False, basis_size=2)
     for number in np.linspace(1, questions(tracks, settings), 6).astype(int):
         stopped_at(tracks, settings, number)
 
@@ -410,7 +410,7 @@ def test_a_stop_at_every_call_site_is_reported(case: str) -> None:
 def test_a_stop_at_every_third_query_of_a_small_solve_is_reported() -> None:
     tracks, settings = (
         gallery.face(3, 6, degrees=60).tracks,
-        Settings(prior="smooth", refine_rotations=False, max_reweightings=3),
+        Settings(prior="smooth", refine_rotations=False, max_reweightings=2, basis_size=1),
     )
     for number in range(1, questions(tracks, settings) + 1, 3):
         stopped_at(tracks, settings, number)

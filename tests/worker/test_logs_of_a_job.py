@@ -40,7 +40,7 @@ def test_every_process_logs_the_job_by_its_id(settings: Settings, tmp_path: Path
                     return False
 
             until(up, seconds=60)
-            options = '{"max_reweightings": 2, "outputs": []}'
+            options = '{"method": "pseudo_inverse", "outputs": []}'
             job = http.post("/v1/jobs", files=form(mesh="none", options=options), headers={"X-Request-ID": key}).json()
             until(lambda: Status(http.get(f"/v1/jobs/{job['id']}").json()["status"]).final, seconds=60)
     finally:

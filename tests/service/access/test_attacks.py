@@ -23,6 +23,7 @@ from attack_files import ATTACKS, OVER_HTTP, Attack
 from crafting import CANARY, HONEST
 from peaks import Watched, descendants, watched
 from pliant.cli.demo import running
+from pliant.worker.formats import Limits
 
 ROOT = Path(__file__).parents[3]
 DOCUMENT = ROOT / "build" / "attacks.md"
@@ -31,7 +32,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory peaks ar
 GROWTH = 48 << 20
 """Largest allowed growth of the service's memory for one file, bytes."""
 
-CHILD = 2 << 30
+CHILD = 1 << 30
 """Largest allowed memory of a process that reads a file, bytes."""
 
 
@@ -66,7 +67,10 @@ def opened(folder: Path) -> Iterator[House]:
     with running(folder) as url, httpx.Client(base_url=url, timeout=120) as http:
         new = [pid for pid in descendants(os.getpid()) if pid not in before]
         service = next(pid for pid in new if b"pliant.service" in Path(f"/proc/{pid}/cmdline").read_bytes())
-        honest = send(House(http, service, folder / "data" / "incoming"), Attack("honest", "", lambda: HONEST, ()))
+        quick = {"options": '{"method": "pseudo_inverse", "outputs": []}'}
+        honest = send(
+            House(http, service, folder / "data" / "incoming"), Attack("honest", "", lambda: HONEST, (), texts=quick)
+        )
         assert honest.status == 202, honest.problem  # loads what reading needs before anything is measured
         yield House(http, service, folder / "data" / "incoming")
 
@@ -115,6 +119,8 @@ def table(house: House) -> str:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for attack in ATTACKS:
+        if attack.limits != Limits():  # within those of a service
+            continue
         got = send(house, attack)
         child = f"{got.memory.children / 1e6:.0f} MB" if got.memory.started else "–"
         rows.append(
@@ -140,7 +146,7 @@ def main() -> None:
             text = table(house)
     DOCUMENT.parent.mkdir(exist_ok=True)
     DOCUMENT.write_text(HEAD + text + "\n", encoding="utf-8")
-    print(json.dumps({"attacks": len(ATTACKS)}))
+    print(json.dumps({"attacks": text.count("\n") - 1}))
 
 
 if __name__ == "__main__":

@@ -18,31 +18,38 @@ from pliant.solver.model.so3 import angles_between, exponential, nearest
 from pliant.solver.tracks.normalization import normalize
 
 FRAMES = 16
+FACE = normalize(gallery.face(FRAMES, 120).tracks)
+
+
+@pytest.fixture(scope="module")
+def found() -> CameraEstimate:
+    return estimate_cameras(FACE, Settings())
 
 
 @pytest.mark.slow
-def test_candidates_are_cameras_of_every_factorization_and_of_smooth_starts() -> None:
-    face = gallery.face(16, 120)
-    found = estimate_cameras(normalize(face.tracks), Settings())
+def test_candidates_are_cameras_of_every_factorization_and_of_smooth_starts(found: CameraEstimate) -> None:
     sizes = [each.basis_size for each in found.candidates]
     assert set(sizes) == {size for size in CANDIDATES if size <= 2 * 16 / 3}
     assert len(sizes) == len(set(sizes)) + SMOOTH_STARTS
     for rotations in (each.rotations for each in found.candidates):
         assert np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3))
         assert np.allclose(rotations[0], np.eye(3))
-    assert not estimate_cameras(normalize(face.tracks), Settings(refine_rotations=False)).candidates
 
 
 @pytest.mark.slow
-def test_hypotheses_are_distinct_cameras_of_plausible_depth() -> None:
-    face = gallery.face(16, 120)
-    found = estimate_cameras(normalize(face.tracks), Settings())
+def test_hypotheses_are_distinct_cameras_of_plausible_depth(found: CameraEstimate) -> None:
     assert found.hypotheses
     assert len({each.basis_size for each in found.hypotheses}) == len(found.hypotheses)
     for rotations in (each.rotations for each in found.hypotheses):
         assert rotations.shape == (16, 3, 3)
         assert depth(found.gram, rotations) < MAX_START_DEPTH_VARIANCE
-    assert not estimate_cameras(normalize(face.tracks), Settings(refine_rotations=False)).hypotheses
+
+
+@pytest.mark.slow
+def test_cameras_that_are_not_refined_have_no_further_starts() -> None:
+    found = estimate_cameras(FACE, Settings(refine_rotations=False))
+    assert not found.candidates
+    assert not found.hypotheses
 
 
 @pytest.mark.slow
@@ -55,9 +62,8 @@ def test_a_sheet_has_no_further_starts() -> None:
 
 @pytest.mark.slow
 def test_cameras_with_implausible_depth_are_not_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
-    face = gallery.face(16, 120)
     monkeypatch.setattr("pliant.solver.cameras.estimation.MAX_START_DEPTH_VARIANCE", 0.0)
-    assert not estimate_cameras(normalize(face.tracks), Settings()).hypotheses
+    assert not estimate_cameras(FACE, Settings()).hypotheses
 
 
 @pytest.mark.parametrize("kind", ["candidates", "hypotheses"])

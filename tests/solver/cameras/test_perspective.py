@@ -147,7 +147,7 @@ def test_the_cameras_project_to_the_pixels_given(close: Solution) -> None:
 
 
 @pytest.mark.slow
-def test_mirrored_input_gives_mirrored_shapes(close: Solution) -> None:
+def test_mirrored_input_gives_mirrored_shapes() -> None:
     """Under perspective the mirrored shape has different images, so depth gets the opposite sign."""
     other = SEEN * [1, 1, -1]
     found = solve(pinhole(other, FOCAL), settings=Settings(image_size=PICTURE, focal=FOCAL, **ONE))
@@ -187,7 +187,8 @@ def test_camera_distances_of_a_rigid_object_are_as_exact_as_its_shape() -> None:
 def test_a_principal_point_off_centre_is_used() -> None:
     corner = np.array([200.0, 650.0])
     views = pinhole(SEEN + np.array([150.0, -200.0, 0.0]), FOCAL, corner)
-    found = solve(views, settings=Settings(camera="perspective", focal=FOCAL, principal_point=(200.0, 650.0), **ONE))
+    settings = Settings(camera="perspective", focal=FOCAL, principal_point=(200.0, 650.0))
+    found = solve(views, cameras=KnownCamera.from_arrays(FACE.rotations, np.ones(8)), settings=settings)
     assert e3d_frame_scaled(found.shapes, SEEN) < 0.03
     assert reprojection(views, found).rms < 1.0
     assert found.camera.principal_point == pytest.approx(corner)
@@ -195,7 +196,9 @@ def test_a_principal_point_off_centre_is_used() -> None:
 
 @pytest.mark.slow
 def test_a_wrong_focal_length_is_used_and_reported_as_improbable() -> None:
-    found = solve(pinhole(SEEN, FOCAL), settings=Settings(image_size=PICTURE, focal=3 * FOCAL, **ONE))
+    found = solve(
+        pinhole(SEEN, FOCAL), settings=Settings(image_size=PICTURE, focal=3 * FOCAL, max_reweightings=1, **ONE)
+    )
     assert found.camera.focal == pytest.approx(3 * FOCAL)
     assert any("improbable" in warning for warning in found.choices.warnings)
 
@@ -207,8 +210,9 @@ def test_a_field_of_view_is_a_focal_length() -> None:
 
 @pytest.mark.slow
 def test_orthographic_tracks_give_the_orthographic_result_to_the_bit() -> None:
-    plain = solve(FACE.tracks, settings=Settings(camera="scaled_orthographic", **ONE))
-    chosen = solve(FACE.tracks, settings=Settings(**ONE))
+    few = gallery.face(6, 30, degrees=70).tracks
+    plain = solve(few, settings=Settings(camera="scaled_orthographic", max_reweightings=3, **ONE))
+    chosen = solve(few, settings=Settings(max_reweightings=3, **ONE))
     assert chosen.choices.camera == "scaled_orthographic"
     assert chosen.choices.depth_sign == "ambiguous"
     assert np.array_equal(chosen.shapes, plain.shapes)

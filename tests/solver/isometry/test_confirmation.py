@@ -43,7 +43,7 @@ def test_wrong_depths_that_preserve_lengths_are_detected() -> None:
 
 @pytest.mark.slow
 def test_a_surface_that_the_halves_do_not_confirm_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    tracks = rolled(frames=6, side=7).tracks
+    tracks = rolled(frames=5, side=6).tracks
     monkeypatch.setattr(surface, "disagreement", lambda search, chosen: 0.4)
     refused = isometric_surface(tracks, focal=FOCAL, image_size=SIZE)
     assert refused.surface is None

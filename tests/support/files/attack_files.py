@@ -55,6 +55,7 @@ from crafting import (
     png,
     zeros,
 )
+from pliant.worker.formats.records import Limits
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,8 @@ class Attack:
     part: str = "tracks"
     texts: Mapping[str, str] = field(default_factory=dict)
     statuses: tuple[int, ...] = (422,)
+    limits: Limits = field(default_factory=Limits)
+    """The limits that the file exceeds. One that exceeds the usual ones as well can be sent to a service."""
 
     def __str__(self) -> str:
         return self.name
@@ -73,13 +76,14 @@ class Attack:
 
 ZIPS = (
     Attack("zip bomb", "1 MB that inflates to 1,074 MB", lambda: zeros(1025, "(1025, 65536, 2)"), ("too_large",)),
-    Attack("zip bomb below the limit", "0.8 MB that inflates to 800 MB", lambda: zeros(800, "(800, 65536, 2)"), ("too_large",)),
+    Attack("zip bomb below the limit", "40 kB that inflate to 40 MB", lambda: zeros(40, "(40, 65536, 2)"), ("too_large",),
+           limits=Limits(max_observations=2_000_000)),
     Attack("member larger than declared", "4 MB behind a directory entry of 1 kB", declared_smaller, ("damaged_file",)),
     Attack("overlapping members", "60 directory entries share one member", overlapping,
            ("damaged_file", "duplicate_member", "missing_array")),
     Attack("duplicate members", "two members named tracks.npy", lambda: archive(("tracks.npy", HONEST), ("tracks.npy", HONEST)),
            ("duplicate_member",)),
-    Attack("5,000 members", "a directory of 5,000 entries", many_members, ("too_large",)),
+    Attack("many members", "a directory of 1,000 entries", many_members, ("too_large",)),
     Attack("huge directory", "a directory that claims 4 GB", lambda: patched(archive(("tracks.npy", HONEST)),
            archive(("tracks.npy", HONEST))[-10:-6], b"\xff\xff\xff\xff"), ("too_large", "damaged_file")),
     Attack("64-bit directory", "a zip64 locator", lambda: patched(archive(("tracks.npy", HONEST)), b"PK\x05\x06",
@@ -117,9 +121,9 @@ HEADERS = (
 NUMBERS = (
     Attack("all NaN", "no finite coordinate", lambda: npy(np.full((6, 20, 2), np.nan)), ("nothing_visible",)),
     Attack("all infinite", "infinity everywhere", lambda: npy(np.full((6, 20, 2), np.inf)), ("nothing_visible",)),
-    Attack("10 million frames", "F = 10,000,000, one byte a number", lambda: archive(("tracks.npy", npy(np.zeros((10**7, 4, 2), "u1")))),
+    Attack("2 million frames", "F = 2,000,000, one byte a number", lambda: archive(("tracks.npy", npy(np.zeros((2 * 10**6, 4, 2), "u1")))),
            ("too_large",)),
-    Attack("10 million points", "P = 10,000,000", lambda: archive(("tracks.npy", npy(np.zeros((3, 10**7, 2), "u1")))), ("too_large",)),
+    Attack("2 million points", "P = 2,000,000", lambda: archive(("tracks.npy", npy(np.zeros((3, 2 * 10**6, 2), "u1")))), ("too_large",)),
     Attack("no points", "P = 0", lambda: npy(np.zeros((6, 0, 2))), ("too_few_points", "wrong_shape")),
     Attack("huge grid in words", "mesh = 999999x999999", lambda: HONEST, ("vertex_count_mismatch",), texts={"mesh": "999999x999999"}),
     Attack("huge numbers in options", "frames, stride, max_points beyond all bounds", lambda: HONEST, ("invalid_option",),
@@ -145,15 +149,15 @@ HDF5 = (
     Attack("HDF5 bomb", "1.4 kB that is 800 MB of zeros", lambda: hdf5(hdf5_bomb), ("too_large",)),
     Attack("HDF5 circle", "a group that holds itself", lambda: hdf5(hdf5_circle), ("too_large",)),
     Attack("HDF5 depth", "200 nested groups", lambda: hdf5(hdf5_deep), ("too_large",)),
-    Attack("HDF5 width", "5,000 variables", lambda: hdf5(lambda f: [f.create_group(f"g{index}") for index in range(5000)]), ("too_large",)),
+    Attack("HDF5 width", "1,000 variables", lambda: hdf5(lambda f: [f.create_group(f"g{index}") for index in range(1000)]), ("too_large",)),
     Attack("HDF5 cells", "25,000 cells of one matrix", lambda: hdf5(hdf5_cells), ("too_large",)),
     Attack("HDF5 cut off", "half a file", lambda: hdf5(hdf5_cells)[:5000], ("damaged_file",)),
     Attack("HDF5 noise", "a signature and noise", lambda: b"\x89HDF\r\n\x1a\n" + np.random.default_rng(0).bytes(4000), ("damaged_file",)),
 )  # fmt: skip
 
 MAT5 = (
-    Attack("MAT packed bomb", "1 MB that inflates to 1 GB", mat_packed_bomb, ("too_large", "damaged_file", "too_slow")),
-    Attack("MAT small bomb", "45 kB that inflate to 46 MB, 24 times over", mat_many_bombs, ("too_large",)),
+    Attack("MAT packed bomb", "0.3 MB that inflates to 268 MB", mat_packed_bomb, ("too_large", "damaged_file", "too_slow")),
+    Attack("MAT small bomb", "8 kB that inflate to 7.7 MB, 10 times over", mat_many_bombs, ("too_large",), limits=Limits(max_bytes=64 << 20)),
     Attack("MAT dimensions", "a size of 2³¹ − 1 by 2³¹ − 1", lambda: mat_matrix((2**31 - 1, 2**31 - 1)), ("too_large",)),
     Attack("MAT negative dimensions", "a size of −4 by −4", lambda: mat_matrix((-4, -4)), ("damaged_file", "missing_array", "too_large")),
     Attack("MAT lying size", "an element that claims 4 GB", lambda: mat_matrix((2, 4), size=0xFFFFFFF0), ("damaged_file", "too_large")),
@@ -171,7 +175,7 @@ TEXT = (
     Attack("CSV of far frames", "frame 999,999,999", lambda: observations("0,0,1,2", "999999999,0,1,2"), ("too_large",)),
     Attack("CSV of far points", "point 10³⁰⁸", lambda: observations("0,0,1,2", "0,1e308,1,2"), ("damaged_file",)),
     Attack("CSV of repeats", "one observation twice", lambda: observations("0,0,1,2", "0,0,1,2"), ("duplicate_observation",)),
-    Attack("CSV of one line", "4 MB without a line break", lambda: b"frame,point,x,y\n" + b"1," * (2 << 20), ("unreadable_table",)),
+    Attack("CSV of one line", "1 MB without a line break", lambda: b"frame,point,x,y\n" + b"1," * (1 << 19), ("unreadable_table",)),
     Attack("CSV of columns", "100,000 columns", lambda: b"frame,point,x,y" + b",a" * 100_000 + b"\n", ("damaged_file", "unknown_format")),
     Attack("CSV not text", "bytes that are no UTF-8", lambda: b"frame,point,x,y\n0,0,\xff\xfe,1\n", ("unreadable_table",)),
     Attack("CSV of infinity", "frame inf", lambda: observations("inf,0,1,2"), ("damaged_file",)),
@@ -186,7 +190,8 @@ MESHES = (
            ("damaged_file", "index_out_of_range"), part="mesh"),
     Attack("OBJ of long numbers", "a number of 4,000 digits", lambda: (OBJ_POINTS + "f 1 2 " + "9" * 4000 + "\n").encode(),
            ("damaged_file", "index_out_of_range"), part="mesh"),
-    Attack("OBJ of many points", "1,500,000 vertices", lambda: b"v 0 0 0\n" * 1_500_000, ("too_large",), part="mesh"),
+    Attack("OBJ of many points", "100,000 vertices where 50,000 are allowed", lambda: b"v 0 0 0\n" * 100_000, ("too_large",), part="mesh",
+           limits=Limits(max_points=50_000)),
     Attack("OBJ with another file", "mtllib ../../etc/passwd", lambda: (f"mtllib ../../..{SECRET}\n" + OBJ_POINTS + "f 1 2 99\n").encode(),
            ("index_out_of_range",), part="mesh"),
     Attack("PLY count", "10¹⁵ vertices", lambda: ply("element vertex 1000000000000000\nproperty float x\n"), ("too_large",), part="mesh"),
@@ -195,9 +200,9 @@ MESHES = (
     Attack("PLY negative count", "−5 vertices", lambda: ply("element vertex -5\nproperty float x\n"), ("too_large", "damaged_file"), part="mesh"),
     Attack("PLY list", "a face of 4,294,967,295 corners", lambda: ply(PLY_VERTEX + PLY_FACE, bytes(240) + b"\xff\xff\xff\xff"),
            ("damaged_file", "too_large"), part="mesh"),
-    Attack("PLY properties", "50,000 properties", lambda: ply("element vertex 20\n" + "".join(f"property float p{i}\n" for i in range(50_000))),
+    Attack("PLY properties", "10,000 properties", lambda: ply("element vertex 20\n" + "".join(f"property float p{i}\n" for i in range(10_000))),
            ("damaged_file", "too_large"), part="mesh"),
-    Attack("PLY without an end", "a header that never ends", lambda: b"ply\nformat ascii 1.0\n" + b"comment x\n" * 100_000,
+    Attack("PLY without an end", "a header that never ends", lambda: b"ply\nformat ascii 1.0\n" + b"comment x\n" * 20_000,
            ("damaged_file",), part="mesh"),
     Attack("PLY cut off", "half the vertices", lambda: ply(PLY_VERTEX + PLY_FACE, bytes(100)), ("damaged_file",), part="mesh"),
     Attack("glTF lying count", "an accessor of 4,000,000 over 240 bytes", lambda: glb(gltf(accessors=accessors(count=4_000_000)), BINARY),
@@ -218,9 +223,9 @@ MESHES = (
     Attack("PNG bomb", "a header of 60,000 × 60,000 pixels", lambda: png(60_000, 60_000, data=zlib.compress(bytes(1000))), ("too_large",),
            part="mesh"),
     Attack("PNG of 2³¹ pixels a side", "the largest size there is", lambda: png(2**31 - 1, 2**31 - 1), ("too_large", "damaged_file"), part="mesh"),
-    Attack("PNG within the limit", "7,000 × 7,000 in 50 kB", lambda: png(7000, 7000, data=zlib.compress(bytes(7001 * 7000), 9)),
+    Attack("PNG within the limit", "2,000 × 2,000 in 4 kB", lambda: png(2000, 2000, data=zlib.compress(bytes(2001 * 2000), 9)),
            ("vertex_count_mismatch", "index_out_of_range"), part="mesh"),
-    Attack("PNG text bomb", "a comment that inflates to 500 MB", lambda: png(4, 5, (b"zTXt", b"a\0\0" + deflated(b"", 500))),
+    Attack("PNG text bomb", "a comment that inflates to 100 MB", lambda: png(4, 5, (b"zTXt", b"a\0\0" + deflated(b"", 100))),
            ("damaged_file",), part="mesh"),
     Attack("PNG cut off", "no pixels", lambda: png(4, 5, data=b""), ("damaged_file",), part="mesh"),
     Attack("other picture", "a GIF as mask", lambda: b"GIF89a" + struct.pack("<HH", 60_000, 60_000) + bytes(20), ("unknown_format",), part="mesh"),
@@ -252,8 +257,8 @@ FILMS = (
            mp4_box(b"hdlr", bytes(8) + b"soun" + bytes(13))))) + mp4_box(b"mdat", bytes(1000)), ("no_picture",), part="film"),
     Attack("film of boxes", "an MP4 of 30,000 empty boxes", lambda: FTYP + mp4_box(b"free") * 30_000, ("unsupported_film",), part="film"),
     Attack("headless AVI", "an AVI that ends inside its header", lambda: b"RIFF\0\0\0\0AVI LIST", ("truncated_film",), part="film"),
-    Attack("film zip bomb", "a zip of pictures that unpack to 64 MB of zeros each", lambda: archive(*((f"{n}.png", bytes(64 << 20)) for n in range(3))),
-           ("too_many_bytes", "broken_picture"), part="film"),
+    Attack("film zip bomb", "a zip of pictures that unpack to 8 MB of zeros each", lambda: archive(*((f"{n}.png", bytes(8 << 20)) for n in range(3))),
+           ("too_many_bytes",), part="film", limits=Limits(max_bytes=16 << 20)),
     Attack("GIF of 60,000 × 60,000", "an animated GIF that states a huge size", lambda: b"GIF89a" + struct.pack("<HH", 60_000, 60_000) + bytes(20),
            ("too_many_pixels", "broken_picture"), part="film"),
 )  # fmt: skip

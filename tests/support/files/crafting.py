@@ -116,7 +116,7 @@ def overlapping() -> bytes:
 
 
 def many_members() -> bytes:
-    return archive(*((f"a{index}.npy", b"") for index in range(5000)), method=zipfile.ZIP_STORED)
+    return archive(*((f"a{index}.npy", b"") for index in range(1000)), method=zipfile.ZIP_STORED)
 
 
 def encrypted() -> bytes:
@@ -201,11 +201,11 @@ def mat_nested(depth: int) -> bytes:
 
 
 def mat_packed_bomb() -> bytes:
-    """Return a compressed variable that inflates to a gigabyte, whatever its dimensions are."""
+    """Return a compressed variable that inflates to 268 MB, whatever its dimensions are."""
     inside = (
         mat_element(6, struct.pack("<II", 6, 0)) + mat_element(5, struct.pack("<2i", 10, 10)) + mat_element(1, b"W")
     )
-    content = deflated(struct.pack("<II", 14, 1 << 30) + inside + struct.pack("<II", 9, 1 << 30), 1 << 10)
+    content = deflated(struct.pack("<II", 14, 1 << 28) + inside + struct.pack("<II", 9, 1 << 28), 1 << 8)
     return MAT_HEADER + struct.pack("<II", 15, len(content)) + content
 
 
@@ -214,8 +214,8 @@ def ply(head: str, body: bytes = b"", *, kind: str = "binary_little_endian") -> 
 
 
 def mat_many_bombs() -> bytes:
-    whole = mat5({"W": np.zeros((2400, 2400))}, packed=True)
-    return whole[:128] + 24 * whole[128:]
+    whole = mat5({"W": np.zeros((980, 980))}, packed=True)
+    return whole[:128] + 10 * whole[128:]
 
 
 PLY_VERTEX = "element vertex 20\nproperty float x\nproperty float y\nproperty float z\n"

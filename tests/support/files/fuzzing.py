@@ -108,7 +108,7 @@ def honest(parser: str) -> list[bytes]:
 @cache
 def small_attacks() -> list[bytes]:
     """Attacks of every kind that are small and quickly made."""
-    slow = ("bomb", "small bomb", "many", "million", "5,000", "count")
+    slow = ("bomb", "small bomb", "many", "million", "count")
     attacks = [
         one for one in (*ZIPS, *HEADERS, *HDF5, *MAT5, *TEXT, *MESHES) if not any(word in one.name for word in slow)
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -29,9 +30,9 @@ def make_inputs(path: Path, *, frames: int, points: int) -> Inputs:
     return _saved(path, sequence.tracks, sequence.mesh, GroundTruth(sequence.shapes), None)
 
 
-def make_long_inputs(path: Path) -> Inputs:
+def make_long_inputs(path: Path, sequence: gallery.Sequence | None = None) -> Inputs:
     """Write canonical inputs of a job that runs until it is stopped."""
-    sequence = long_sequence()
+    sequence = sequence or long_sequence()
     return _saved(path, sequence.tracks, None, None, KnownCamera(sequence.rotations))
 
 
@@ -124,6 +125,16 @@ class House:
 
     def job_processes(self) -> list[int]:
         return [child for pid in self.worker_pids() for child in children(pid)]
+
+    def freeze(self) -> None:
+        """Stop the job processes: their workers keep them alive, and they take no processor time."""
+        for pid in self.job_processes():
+            os.kill(pid, signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        """Let the job processes go on, so that they can end when their jobs are cancelled."""
+        for pid in self.job_processes():
+            os.kill(pid, signal.SIGCONT)
 
     def files_at_work(self) -> list[str]:
         return [path.name for path in self.settings.work.iterdir()]

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pliant.schemas.job import Status
+from pliant.solver.gallery import face
 from pliant.worker.execution.pipeline import reconstruct
 from pliant.worker.formats import load_inputs
 from pliant.worker.jobs.retry import retry
@@ -23,7 +24,7 @@ from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 from rq import Queue as RqQueue
 from rq.serializers import JSONSerializer
-from worker_house import SHORT, House, children, make_inputs, running, settled
+from worker_house import SHORT, House, children, make_long_inputs, running, settled
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
 
@@ -210,27 +211,33 @@ def test_a_duplicate_delivery_is_dropped(house: House) -> None:
     id = house.submit(long=True)
     job = house.solving(id)
     attempt_id = house.jobs.records.get(id).attempt_id
+    house.freeze()
     house.jobs.queue.push(id, attempt_id)
     house.until(lambda: not house.jobs.queue.waiting(), "the second delivery is taken")
     time.sleep(0.5)
     held = house.jobs.records.get(id)
     assert (held.attempt_id, held.job.status, held.job.attempt) == (attempt_id, Status.RUNNING, job.attempt)
     assert house.files_at_work() == [attempt_id], "the second worker has not cleared the first one's files away"
+    house.thaw()
     house.jobs.cancel(id)
     house.final(id)
 
 
 @pytest.mark.slow
 def test_a_job_missing_from_the_queue_is_completed(house: House) -> None:
-    first, second = house.submit(long=True), house.submit(long=True)
+    first = house.submit(long=True)
     house.solving(first)
+    house.freeze()
+    second = house.submit(long=True)
     house.solving(second)
     id = house.submit()
     house.jobs.queue.remove(house.jobs.records.get(id).attempt_id)
-    house.jobs.cancel(first)
+    house.jobs.cancel(second)
     assert house.final(id).status is Status.SUCCEEDED
     assert "missing from the queue" in house.jobs.log(id)
-    house.jobs.cancel(second)
+    house.thaw()
+    house.jobs.cancel(first)
+    house.final(first)
     house.final(second)
 
 
@@ -275,7 +282,7 @@ def test_a_job_over_its_time_limit_fails_as_timed_out(house: House, tmp_path: Pa
 
 @pytest.mark.slow
 def test_a_job_over_its_memory_limit_fails_as_out_of_memory(house: House, tmp_path: Path) -> None:
-    make_inputs(tmp_path / "big.npz", frames=200, points=6000)
+    make_long_inputs(tmp_path / "big.npz", face(60, 30_000))
     settings = dataclasses.replace(
         house.settings, data=tmp_path, queue=f"lean-{secrets.token_hex(3)}", workers=1, memory_limit=640 << 20
     )

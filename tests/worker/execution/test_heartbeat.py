@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -16,7 +17,7 @@ from pliant.worker.store.connection import connect
 from rq import Queue as RqQueue
 from rq.registry import FailedJobRegistry, StartedJobRegistry
 from rq.serializers import JSONSerializer
-from worker_house import House
+from worker_house import House, children
 
 pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="job processes die with their worker on Linux"),
@@ -58,7 +59,9 @@ def registered(settings: Settings, inputs: tuple[Path, Path], *, beat_every: int
     worker = subprocess.Popen([sys.executable, "-c", WORKER, str(beat_every)], env=env)
     try:
         id = house.submit(long=True)
-        house.until(lambda: house.jobs.get(id).status is Status.RUNNING, "it runs")
+        house.until(lambda: house.jobs.get(id).status is Status.RUNNING and children(worker.pid), "it runs")
+        (job_process,) = children(worker.pid)
+        os.kill(job_process, signal.SIGSTOP)  # a long job that takes no processor time; the heartbeat is the worker's
         until = time.monotonic() + LEASE + 1.5
         while time.monotonic() < until:
             house.jobs.queue.tidy()
@@ -66,6 +69,7 @@ def registered(settings: Settings, inputs: tuple[Path, Path], *, beat_every: int
         started = StartedJobRegistry(queue=queue).get_job_ids(cleanup=False)
         failed = FailedJobRegistry(queue=queue).get_job_ids(cleanup=False)
         assert house.jobs.get(id).status is Status.RUNNING, "our own record is not concerned"
+        os.kill(job_process, signal.SIGCONT)
         house.jobs.cancel(id)
         house.until(lambda: house.jobs.get(id).status.final, "it ends")
         return len(started), len(failed)

@@ -14,7 +14,7 @@ from pliant.worker.films.sources import FilmSource
 from pliant.worker.films.tracker import FilmBounds, check_film
 from pliant.worker.formats import store_inputs
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("forked_readers")]
 
 
 @pytest.mark.parametrize("attack", [each for each in ATTACKS if each.name not in OVER_HTTP], ids=str)
@@ -26,9 +26,9 @@ def test_a_crafted_file_is_refused_by_its_reader(attack: Attack, tmp_path: Path)
     given: dict[str, Path | str] = {"tracks": honest, **attack.texts, attack.part: crafted}
     given.pop("options", None)
     read = (
-        partial(check_film, FilmSource(crafted, None), options, FilmBounds())
+        partial(check_film, FilmSource(crafted, None), options, FilmBounds(max_bytes=attack.limits.max_bytes))
         if attack.part == "film"
-        else partial(store_inputs, **given, options=options, target=tmp_path / "inputs.npz")  # type: ignore[arg-type]
+        else partial(store_inputs, **given, options=options, limits=attack.limits, target=tmp_path / "inputs.npz")  # type: ignore[arg-type]
     )
     with pytest.raises(InvalidInput) as caught:
         read()

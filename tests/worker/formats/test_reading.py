@@ -13,6 +13,8 @@ from pliant.solver import InvalidInput, KnownCamera
 from pliant.worker.formats import Inputs, Limits, load_inputs, read_inputs, save_inputs
 from results import moving_sheet
 
+pytestmark = pytest.mark.usefixtures("forked_readers")
+
 F, P = 12, 30
 
 

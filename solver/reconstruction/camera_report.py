@@ -1,4 +1,4 @@
-"""Report sentences about the choice between orthography and perspective."""
+"""Report sentences about the choice between orthography and perspective, which `refinement.focal_length` makes."""
 
 from __future__ import annotations
 
