@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from pliant.solver.isometry.surface import IsometricVerdict
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import pulses_to
@@ -112,10 +111,10 @@ def _solved(
         solution = shapes_in_blocks(
             tracks, cameras, prior, mesh, settings, monitor, seconds={"cameras": learning}, scratch=scratch
         )
-        return solution if verdict is None else _with_verdict(solution, verdict, settings)
+        return solution if verdict is None else with_verdict(solution, verdict, settings)
     seconds = {"cameras": learning, "initialise": 0.0}
     solution = shapes_from(_started(tracks, cameras, prior, mesh, settings, monitor, seconds), monitor, seconds=seconds)
-    return solution if verdict is None else _with_verdict(solution, verdict, settings)
+    return solution if verdict is None else with_verdict(solution, verdict, settings)
 
 
 def _started(
@@ -133,10 +132,6 @@ def _started(
     start = with_outliers_rejected(prepared(tracks, cameras, prior, mesh, settings, should_stop=monitor), monitor)
     seconds["initialise"] += time.perf_counter() - began
     return with_outlier_reason(start)
-
-
-def _with_verdict(solution: Solution, verdict: IsometricVerdict, settings: Settings) -> Solution:
-    return replace(solution, choices=with_verdict(solution.choices, verdict, settings))
 
 
 def _learned(observations: Observations, monitor: Monitor) -> tuple[Cameras, Prior | None]:

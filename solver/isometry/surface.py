@@ -173,6 +173,18 @@ def isometric_surface(
     return IsometricVerdict(why, _trace(tried), surface, _warnings(clear, focal, least, chosen))
 
 
+def sheetlike(tracks: Tracks) -> float | None:
+    """Return how far the pictures differ from those of a plane, relative to its size, if that is as little as for a sheet, else None.
+
+    Needs neither focal length nor principal point.
+    """
+    seen = tracks.visible > 0
+    part = _some_frames(tracks.points, seen)
+    search = _prepared(tracks.points[part], seen[part], np.zeros(2), None)
+    off = float("inf") if search is None else off_homography(search.anchors)
+    return off if off <= SHEETLIKE else None
+
+
 def _implausible(search: FocalSearch | None, focal: float, required: bool) -> str | None:
     """Return the reason why the tracks cannot show an isometric sheet; None if they may."""
     if search is None:

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 from pliant.solver.errors import InvalidSettings
-from pliant.solver.isometry.surface import IsometricVerdict, isometric_surface
+from pliant.solver.evaluation.trust import Verdict
+from pliant.solver.isometry.surface import IsometricVerdict, isometric_surface, sheetlike
 from pliant.solver.monitor import Monitor
-from pliant.solver.records import Choices, KnownCamera, Step, Tracks
+from pliant.solver.records import KnownCamera, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.inliers import with_inlier_probability
 from pliant.solver.shapes.isometric_solution import centre_downwards, downwards, isometric_solution
@@ -21,15 +22,22 @@ def tries_isometry(cameras: KnownCamera | None, settings: Settings) -> bool:
     """Whether the tracks are tested for an isometric surface."""
     if settings.surface != "auto":
         return settings.surface == "isometric"
+    return _may_be_isometric(cameras, settings) and _knows_lens(settings)
+
+
+def _may_be_isometric(cameras: KnownCamera | None, settings: Settings) -> bool:
+    return settings.gaussian and cameras is None and settings.camera in {Settings().camera, "perspective"}
+
+
+def _knows_lens(settings: Settings) -> bool:
     # Without image size or focal length, the inconsistency I has false minima for cloth at a large distance.
-    pinhole = settings.focal_length is not None or settings.image_size is not None
-    return settings.gaussian and pinhole and cameras is None and settings.camera in {Settings().camera, "perspective"}
+    return settings.focal_length is not None or settings.image_size is not None
 
 
 def isometric_verdict(
     tracks: Tracks, cameras: KnownCamera | None, settings: Settings, monitor: Monitor
 ) -> IsometricVerdict | None:
-    """Return the verdict on whether the surface is isometric; None if this is not tested.
+    """Return the verdict on whether the surface is isometric; None if the question does not arise.
 
     Raises
     ------
@@ -42,11 +50,30 @@ def isometric_verdict(
             hint="Omit the rotations: an isometric surface determines its own cameras.",
         )  # fmt: skip
     if not tries_isometry(cameras, settings):
-        return None
+        return _untested(tracks) if settings.surface == "auto" and _may_be_isometric(cameras, settings) else None
     return isometric_surface(
         downwards(tracks) if settings.y_up else tracks, focal=settings.focal_length, principal_point=centre_downwards(settings),
         image_size=settings.image_size, required=settings.surface == "isometric", should_stop=monitor,
     )  # fmt: skip
+
+
+def _untested(tracks: Tracks) -> IsometricVerdict | None:
+    """Return the verdict on tracks whose lens is unknown; None if they do not resemble those of a sheet."""
+    off = sheetlike(tracks)
+    if off is None:
+        return None
+    return IsometricVerdict(
+        "Isometry was not tested, because neither image_size nor focal is given. The pictures differ from those of a plane by "
+        f"{off:.1%} of its size, as those of a sheet do.",
+        warnings=(_unknown_lens_warning(),),
+    )
+
+
+def _unknown_lens_warning() -> str:
+    return (
+        "The object may be a sheet that bends, which was not tested. Give image_size or focal, so that its bending can be recovered "
+        "from perspective."
+    )
 
 
 def solution_of(
@@ -62,12 +89,19 @@ def solution_of(
     return with_inlier_probability(solution, tracks, used, full_confidence=normalized.full_confidence, loss="l2")
 
 
-def with_verdict(choices: Choices, verdict: IsometricVerdict, settings: Settings) -> Choices:
-    """Return the choices with the reason for a free surface, and a warning if an isometric surface was required."""
+def with_verdict(solution: Solution, verdict: IsometricVerdict, settings: Settings) -> Solution:
+    """Return the solution of a free surface with the reason for it.
+
+    A warning is added if an isometric surface was required. The warnings of the verdict are added if the solution is not good.
+    """
+    choices, trust = solution.choices, solution.trust
     warnings = choices.warnings
     if settings.surface == "isometric":
         warnings = (*warnings, f"The surface was not accepted as isometric and is solved as free. {verdict.reason}")
+    elif trust is None or trust.verdict is not Verdict.GOOD:
+        warnings = (*warnings, *verdict.warnings)
     tried = tuple((each.focal, each.inconsistency) for each in verdict.candidates)
-    return replace(
+    choices = replace(
         choices, reasons={**choices.reasons, "surface": verdict.reason}, warnings=warnings, focal_lengths=tried
     )
+    return replace(solution, choices=choices)

@@ -9,9 +9,9 @@ from pliant.solver.isometry import surface
 from pliant.solver.isometry.anchors import Anchors
 from pliant.solver.isometry.confirmation import deformation
 from pliant.solver.isometry.homographies import FEWEST_COMMON, off_homography, unlike_homography
-from pliant.solver.isometry.surface import isometric_surface
+from pliant.solver.isometry.surface import isometric_surface, sheetlike
 from pliant.solver.model.so3 import exponential
-from rolled_sheets import CENTRE, SIZE, one_scale_error
+from rolled_sheets import CENTRE, SIZE, one_scale_error, rolled
 
 from benchmarks.sequences import rolled_sheet
 
@@ -64,7 +64,7 @@ def test_coincident_points_are_neither_planar_nor_an_error() -> None:
 
 @pytest.mark.slow
 def test_a_sheet_near_the_camera_is_solved_as_isometric() -> None:
-    sheet = rolled_sheet(bend=(0.2, 0.8))  # its third singular value is .22 of the second
+    sheet = rolled_sheet(6, bend=(0.2, 0.8))  # its third singular value is .22 of the second
     found = solve(sheet.tracks, settings=Settings(image_size=SIZE))
     assert found.choices.reasons["surface"].startswith("Taken as an isometric sheet")
     assert found.camera.focal == pytest.approx(600, rel=0.03)
@@ -80,13 +80,13 @@ def test_isometry_is_not_tested_for_a_solid_body() -> None:
 
 @pytest.mark.slow
 def test_a_rigid_solid_is_not_a_sheet_although_it_preserves_lengths() -> None:
-    across = np.stack(np.meshgrid(np.linspace(-1, 1, 8), np.linspace(-1, 1, 8)), axis=2).reshape(-1, 2)
+    across = np.stack(np.meshgrid(np.linspace(-1, 1, 6), np.linspace(-1, 1, 6)), axis=2).reshape(-1, 2)
     dome = np.column_stack([across, 0.25 * np.exp(-2 * np.square(across).sum(axis=1))])
     tracks = Tracks.from_arrays(500 * pictures(dome, turns(25), 4.0) + CENTRE)
-    verdict = isometric_surface(tracks, image_size=SIZE)
+    verdict = isometric_surface(tracks, focal=500.0, image_size=SIZE)
     assert verdict.surface is None
     assert "as those of a rigid solid do" in verdict.reason
-    assert isometric_surface(tracks, image_size=SIZE, required=True).surface is not None
+    assert isometric_surface(tracks, focal=500.0, image_size=SIZE, required=True).surface is not None
 
 
 @pytest.mark.slow
@@ -113,3 +113,24 @@ def test_deformation_is_the_distance_from_one_rigid_shape() -> None:
     size = np.sqrt(np.square(shape).sum() / 50)
     noisy = moved + 0.01 * size / np.sqrt(3) * random.normal(size=moved.shape)
     assert deformation(noisy) == pytest.approx(0.01 * np.sqrt(6 / 7), rel=0.1)
+
+
+def test_pictures_like_those_of_a_plane_are_recognised_without_a_lens() -> None:
+    sheet = rolled_sheet(6)
+    solid = np.random.default_rng(0).normal(size=(60, 3)) * 0.4
+    assert 0 < (sheetlike(sheet.tracks) or 0) < surface.SHEETLIKE
+    assert sheetlike(Tracks.from_arrays(500 * pictures(solid, turns(30), 4.0))) is None
+    assert sheetlike(Tracks.from_arrays(sheet.tracks.points[:, :5])) is None  # too few to say
+
+
+@pytest.mark.slow
+def test_a_poor_result_for_a_sheet_without_a_lens_asks_for_the_image_size() -> None:
+    sheet = rolled(frames=5, side=6)
+    found = solve(sheet.tracks, settings=Settings(basis_size=1))
+    assert found.trust is not None
+    assert found.trust.verdict != "good"
+    assert found.choices.reasons["surface"].startswith("Isometry was not tested, because neither image_size nor focal")
+    assert any("Give image_size or focal" in warning for warning in found.choices.warnings)
+    free = solve(sheet.tracks, settings=Settings(basis_size=1, surface="free"))
+    assert "surface" not in free.choices.reasons
+    assert np.array_equal(free.shapes, found.shapes)
