@@ -108,6 +108,8 @@ class Guarded(TyperGroup):
                 fault = MissingExtra(f"pliant {ctx.invoked_subcommand or ''}".strip())
             code = code_of(fault)
             if code is None:
+                if hasattr(fault, "option_name") and hasattr(fault, "possibilities"):
+                    _suggest(fault)
                 raise
             from pliant.cli.show import show_fault
 
@@ -117,3 +119,28 @@ class Guarded(TyperGroup):
                 fault, sentence, code, as_json=bool(session is not None and session.json), url=getattr(session, "url", None),
             )  # fmt: skip
             ctx.exit(code)
+
+
+def _suggest(fault: Any) -> None:
+    """Complete a `NoSuchOption` of Typer: with the option that was meant, or with `-O` for an option of the reconstruction.
+
+    The class of the error is Click's or Typer's own, depending on the version of Typer.
+    """
+    from pliant.schemas.options import Options
+    from pliant.schemas.suggestions import closest
+
+    name = str(fault.option_name).lstrip("-").replace("-", "_")
+    own = {
+        spelled.removeprefix("--").replace("-", "_"): spelled
+        for parameter in fault.ctx.command.params
+        for spelled in parameter.opts
+        if spelled.startswith("--")
+    }
+    meant = closest(name, own)
+    if "option" in own and name in Options.model_fields:
+        fault.message += f". It is an option of the reconstruction: -O {name}=VALUE"
+        fault.possibilities = []
+    elif meant is not None:
+        fault.possibilities = [own[meant]]
+    elif "option" in own and (name := closest(name, Options.model_fields) or ""):
+        fault.message += f". An option of the reconstruction is given as -O {name}=VALUE"

@@ -26,7 +26,7 @@ def input_file(path: Path | None, name: str) -> None:
         The file is missing, a folder, or not readable.
     """
     from pliant.client.errors import BadArgument
-    from pliant.client.multipart import existing_file
+    from pliant.client.input_files import existing_file
 
     if path is None:
         return

@@ -87,7 +87,7 @@ class Session:
 
 def name_of(given: str, file: Path) -> str:
     """Return the name of a job: the given one, or its file's name without extension, truncated to the service's limit."""
-    from pliant.client.multipart import job_name
+    from pliant.client.input_files import job_name
 
     return given or job_name(file.resolve().name if file.is_dir() else file.stem)
 

@@ -1,34 +1,35 @@
-"""The files and fields of a submission, made from arrays, dictionaries of trackers, or paths."""
+"""The files and fields of a submission, as a form that can be sent again."""
 
 from __future__ import annotations
 
-import difflib
 import hashlib
-import os
-import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from dataclasses import fields as dataclass_fields
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, cast
+from typing import IO, Any, cast
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pliant.client.errors import BadArgument
+from pliant.client.input_files import (
+    Region,
+    Source,
+    array_part,
+    existing_file,
+    kind_of,
+    mesh_part,
+    refuse_visible,
+    region_part,
+    tracks_file,
+)
+from pliant.schemas.option_faults import option_fault
 from pliant.schemas.options import Options
 from pliant.schemas.problems import ProblemCode
-from pliant.schemas.validation import expectation
 from pydantic import ValidationError
-
-if TYPE_CHECKING:
-    from pydantic_core import ErrorDetails
 
 OnBytes = Callable[[int, int], None]
 """Called with the bytes transferred so far and the total."""
-
-Source = ArrayLike | Mapping[str, Any] | Path | str
-"""An array, a dictionary of arrays as a tracker returns it, or the path of a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,9 +88,6 @@ RESUMABLE_BYTES = 32 * 2**20
 SMALL = 2**20
 """Size up to which a file is always sent with the job, bytes."""
 
-LONGEST_NAME = 200
-"""Maximum length of a job's name, characters."""
-
 
 class Count:
     """Counter of the bytes read from all files of a form."""
@@ -130,7 +128,7 @@ class Inputs:
 
     tracks: Source | None
     film: Path | str | None = None
-    region: Path | str | None = None
+    region: Region | None = None
     visible: ArrayLike | None = None
     mesh: Source | tuple[int, int] | None = None
     ground_truth: Source | None = None
@@ -153,12 +151,12 @@ class Inputs:
                 f"tracks, film: expected one of them, got {'both' if self.film is not None else 'neither'}."
             )
         if self.film is not None:
-            _alone(self.visible)
+            refuse_visible(self.visible)
             files = {"film": existing_file(self.film, "film")}
         elif self.tracks is not None:
             files = {"tracks": tracks_file(self.tracks, self.visible, folder)}
         if self.region is not None:
-            files["region"] = existing_file(self.region, "region")
+            files["region"] = region_part(self.region, folder)
         if self.mesh is not None:
             part = mesh_part(self.mesh, folder)
             if isinstance(part, str):
@@ -184,61 +182,6 @@ class Inputs:
         return self.inputs_of
 
 
-def tracks_file(tracks: Source, visible: ArrayLike | None, folder: Path) -> Path:
-    """Write the tracks to a file that the service reads; a path is used as it is.
-
-    Dictionaries are stored key by key: the service recognises the formats of trackers.
-
-    Raises
-    ------
-    BadArgument
-        `visible` was given with a file or dictionary, which have their own visibility; or a value is not an array.
-    """
-    if isinstance(tracks, str | Path):
-        _alone(visible)
-        return existing_file(tracks, "tracks")
-    if isinstance(tracks, Mapping):
-        _alone(visible)
-        return _npz(folder / "tracks.npz", {str(key): _array(value, str(key)) for key, value in tracks.items()})
-    hidden: NDArray[np.bool] | None = None
-    if isinstance(tracks, np.ma.MaskedArray):
-        hidden = np.asarray(np.ma.getmaskarray(tracks).any(axis=-1))
-    points = _array(np.ma.getdata(tracks) if hidden is not None else tracks, "tracks")
-    arrays = {"tracks": points}
-    if visible is not None:
-        arrays["visibility"] = _array(visible, "visible")
-    elif hidden is not None:
-        arrays["visibility"] = ~hidden
-    return _npz(folder / "tracks.npz", arrays)
-
-
-def mesh_part(mesh: Source | tuple[int, int], folder: Path) -> Path | str:
-    """Return a file of faces, or a text: a grid size such as ``"12x20"``, or ``"none"``.
-
-    Raises
-    ------
-    BadArgument
-        The mesh is neither faces, nor a file, nor such a text.
-    """
-    if isinstance(mesh, str) and re.fullmatch(r"none|\s*\d{1,6}\s*x\s*\d{1,6}\s*", mesh.lower()) is not None:
-        return mesh.lower().replace(" ", "")
-    if isinstance(mesh, str | Path):
-        return existing_file(mesh, "mesh")
-    if isinstance(mesh, tuple) and len(mesh) == 2 and all(isinstance(size, int) for size in mesh):
-        return f"{mesh[0]}x{mesh[1]}"
-    if isinstance(mesh, Mapping):
-        return _npz(folder / "mesh.npz", {str(key): _array(value, str(key)) for key, value in mesh.items()})
-    return _npz(folder / "mesh.npz", {"faces": _array(mesh, "mesh")})
-
-
-def array_part(value: Source, name: str, key: str, folder: Path) -> Path:
-    """Return the file of the ground truth or of the rotations."""
-    if isinstance(value, str | Path):
-        return existing_file(value, name)
-    arrays = value if isinstance(value, Mapping) else {key: value}
-    return _npz(folder / f"{name}.npz", {str(k): _array(v, f"{name}.{k}") for k, v in arrays.items()})
-
-
 def checked_options(options: Options | Mapping[str, Any] | None) -> Options:
     """Validate options locally, before anything is sent or solved.
 
@@ -249,95 +192,22 @@ def checked_options(options: Options | Mapping[str, Any] | None) -> Options:
     """
     if isinstance(options, Options):
         return options
+    if options is not None and not isinstance(options, Mapping):
+        raise BadArgument(
+            f'options: expected a mapping such as {{"loss": "huber"}} or Options, got {kind_of(options)}.',
+            code=ProblemCode.INVALID_OPTION.value,
+        )
     try:
         return Options.model_validate(dict(options or {}))
     except ValidationError as fault:
-        faults = "; ".join(map(_option_fault, fault.errors()))
-        raise BadArgument(
-            f"options: {faults}. `pliant options` lists every option.", code=ProblemCode.INVALID_OPTION.value
-        ) from fault
+        faults = [option_fault(each) for each in fault.errors()]
+        sentences = " ".join(str(each).strip() for each in faults)
+        raise BadArgument(f"{sentences} `pliant options` lists every option.", code=str(faults[0].code)) from fault
 
 
 def option_fields(options: Options | Mapping[str, Any] | None) -> dict[str, str]:
     """Return the form fields of a job's options. Raises as `checked_options`."""
     return {"options": checked_options(options).model_dump_json(exclude_unset=True)}
-
-
-def _alone(visible: ArrayLike | None) -> None:
-    if visible is not None:
-        raise BadArgument(
-            "visible: only valid with an array of tracks. A file or dictionary contains its own visibility."
-        )
-
-
-def expanded(path: Path | str, name: str) -> Path:
-    """Return a path with ``~`` or ``~user`` at its beginning expanded.
-
-    Raises
-    ------
-    BadArgument
-        There is no such user, or the user has no home directory.
-    """
-    try:
-        return Path(path).expanduser()
-    except RuntimeError:
-        raise BadArgument(
-            f"{name}: expected a path, got {path}, and {Path(path).parts[0]} is no user's home directory. "
-            "Write out the whole path."
-        ) from None
-
-
-def job_name(of_file: str) -> str:
-    """Return the name of a job for a file name: valid UTF-8, truncated to `LONGEST_NAME` characters."""
-    return of_file.encode("utf-8", "replace").decode()[:LONGEST_NAME]
-
-
-def existing_file(path: Path | str, name: str) -> Path:
-    """Return the path of an input, with ``~`` expanded.
-
-    Raises
-    ------
-    BadArgument
-        The file is missing, a folder, or not readable.
-    """
-    found = expanded(path, name)
-    if found.is_dir():
-        raise BadArgument(f"{name}: expected a file, got the folder {found}. Give the path of a file in it.")
-    if not found.is_file():
-        raise BadArgument(f"{name}: expected a file, an array or a dictionary of arrays, got no file at {found}.")
-    if not os.access(found, os.R_OK):
-        raise BadArgument(f"{name}: the file {found} cannot be read. Change its permissions.")
-    return found
-
-
-def _option_fault(error: ErrorDetails) -> str:
-    """Describe one invalid option, with the closest name if the option does not exist."""
-    name = ".".join(map(str, error["loc"]))
-    if error["type"] != "extra_forbidden":
-        return f"{name}: expected {expectation(error)}, got {error['input']!r}"
-    close = difflib.get_close_matches(name, Options.model_fields, n=1)
-    return f"{name}: there is no such option" + (f" (did you mean {close[0]}?)" if close else "")
-
-
-def _array(value: Any, name: str) -> NDArray[np.generic]:
-    """Convert anything that NumPy accepts, and PyTorch and JAX tensors on any device."""
-    for step in ("detach", "cpu"):
-        if hasattr(value, step):
-            value = getattr(value, step)()
-    array = np.asarray(value)
-    if array.dtype.kind not in "biuf":
-        raise BadArgument(
-            f"{name}: expected an array of numbers or booleans, got dtype {array.dtype}. "
-            "Pad ragged lists with NaN and omit entries that are not arrays."
-        )
-    return array
-
-
-def _npz(path: Path, arrays: Mapping[str, NDArray[np.generic]]) -> Path:
-    """Write without compression: equal arrays give equal bytes, so the service recognises a repeated submission."""
-    with path.open("wb") as file:
-        np.savez(file, **dict(arrays))  # type: ignore[arg-type]
-    return path
 
 
 def sha256(path: Path) -> str:

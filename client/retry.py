@@ -24,6 +24,9 @@ from pliant.client.multipart import OnBytes
 TEMPORARY = frozenset({502, 503, 504})
 """Statuses of a temporarily unavailable service, or of a proxy in front of it."""
 
+EARLY = 0.05
+"""Seconds by which a timer of the network may end before the deadline that it was set for: several times a timer's resolution."""
+
 OUT_OF_STEP = frozenset({"upload_offset_mismatch", "upload_busy", "upload_taken_over", "upload_complete"})
 """Codes after which the client reads the upload's offset again and continues from there."""
 
@@ -97,11 +100,15 @@ class Attempts:
         """
         left = self.deadline - self.retries.clock()
         if left <= 0:
-            raise WaitTimeout(
-                f"The timeout of {self.timeout:g} s passed during {self.doing}. "
-                "Nothing was cancelled; call again, or use a longer timeout."
-            )
+            raise self._passed()
         return left
+
+    def _passed(self) -> WaitTimeout:
+        """Return the error for a deadline that passed while nothing failed."""
+        return WaitTimeout(
+            f"The timeout of {self.timeout:g} s passed during {self.doing}. "
+            "Nothing was cancelled; call again, or use a longer timeout."
+        )
 
     def bounding(self, on_bytes: OnBytes | None) -> OnBytes:
         """Return `on_bytes` as a callback that raises `WaitTimeout` once the deadline has passed, in the middle of a body."""
@@ -135,6 +142,8 @@ class Attempts:
             No attempt succeeded within the time that `retries` allows.
         """
         now = self.retries.clock()
+        if self.failures == 0 and isinstance(fault, httpx.TimeoutException) and now >= self.deadline - EARLY:
+            raise self._passed() from fault  # every wait for the network ends at the deadline
         if self.failures == 0:
             self.failing_since = now
         bound = min(self.retries.longest_pause, self.retries.shortest_pause * 2.0 ** min(self.failures, 30))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from functools import partial
+from numbers import Real
 from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
@@ -39,26 +40,35 @@ def _in_order(given: tuple[Output, ...]) -> tuple[Output, ...]:
     return tuple(name for name in get_args(Output) if name in given)
 
 
-def _matching(given: str, *, pattern: str, words: str) -> str:
+def _joined(given: object, *, sign: str) -> object:
+    """Accept a pair of numbers, as Python programs have it, for a text such as `"320x240"`. JSON has no pairs, only lists."""
+    if isinstance(given, tuple) and len(given) == 2 and all(isinstance(number, Real) for number in given):
+        return f"{given[0]}{sign}{given[1]}"
+    return given
+
+
+def _matching(given: object, *, pattern: str, words: str) -> object:
     """Return the text if it matches; else raise ValueError with `words`, which are clearer than the pattern."""
-    if re.fullmatch(pattern, given) is None:
+    if not isinstance(given, str) or re.fullmatch(pattern, given) is None:
         raise ValueError(words)
     return given
 
 
 PointText = Annotated[
     str,
-    AfterValidator(partial(_matching, pattern=POINT, words="x,y in pixels, such as 319.5,239.5")),
+    BeforeValidator(partial(_matching, pattern=POINT, words="x,y in pixels, such as 319.5,239.5")),
+    BeforeValidator(partial(_joined, sign=",")),
     WithJsonSchema({"type": "string", "pattern": POINT}),
 ]
 SizeText = Annotated[
     str,
-    AfterValidator(partial(_matching, pattern=SIZE, words="width and height in pixels, such as 1920x1080")),
+    BeforeValidator(partial(_matching, pattern=SIZE, words="width and height in pixels, such as 1920x1080")),
+    BeforeValidator(partial(_joined, sign="x")),
     WithJsonSchema({"type": "string", "pattern": SIZE}),
 ]
 SliceText = Annotated[
     str,
-    AfterValidator(partial(_matching, pattern=SLICE, words="start:stop:step, such as 10:200:2")),
+    BeforeValidator(partial(_matching, pattern=SLICE, words="start:stop:step, such as 10:200:2")),
     WithJsonSchema({"type": "string", "pattern": SLICE}),
 ]
 Pixel = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]

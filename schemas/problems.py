@@ -151,6 +151,7 @@ class ProblemCode(StrEnum):
     # Input files
     NOT_A_RESULT = auto()
     FILM_AS_TRACKS = auto()
+    TRACKS_AS_FILM = auto()
     PICTURE_AS_TRACKS = auto()
     UNREADABLE_TABLE = auto()
     UNKNOWN_FORMAT = auto()
@@ -216,6 +217,7 @@ class ProblemCode(StrEnum):
     TOO_LITTLE_SEEN = auto()
     NO_EXTENT = auto()
     VERTEX_COUNT_MISMATCH = auto()
+    TRANSPOSED_GRID = auto()
     MESH_MISMATCH = auto()
     INDEX_OUT_OF_RANGE = auto()
     DEGENERATE_FACE = auto()

@@ -10,7 +10,7 @@ import asyncio
 import hashlib
 import json
 import re
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -44,6 +44,8 @@ class FormRules:
         Limits on the complete body and on one text.
     stall_seconds : float
         Seconds without a byte after which the request is refused.
+    hint : callable
+        Returns what to do about a part of an unknown name.
     """
 
     files: frozenset[str]
@@ -51,6 +53,7 @@ class FormRules:
     max_body_bytes: int
     max_text_bytes: int
     stall_seconds: float = 60.0
+    hint: Callable[[str], str] = lambda _: "Leave it out."
 
 
 @dataclass(frozen=True)
@@ -231,7 +234,7 @@ class _Reader:
                 field=part.name[:80],
                 expected=expected,
                 got="a part of that name",
-                hint="Leave it out.",
+                hint=rules.hint(part.name),
             )
         if part.name in self._files or part.name in self._texts:
             code = ProblemCode.REPEATED_PART

@@ -17,6 +17,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from pliant.schemas.invalid import Invalid, members_of
 from pliant.schemas.job import Problem
+from pliant.schemas.option_faults import option_fault, shown
 from pliant.schemas.problems import ProblemCode
 from pliant.schemas.validation import expectation
 from pydantic import ValidationError
@@ -127,31 +128,17 @@ def from_validation(errors: Sequence[Any], *, options: bool = False) -> Refusal:
     The values are a job's options if `options` is True, else parameters of the request.
     """
     first = errors[0]
-    where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", "header")]
-    field = ".".join(["options", *where] if options else where) or ("options" if options else "request")
-    unknown = options and first["type"] == "extra_forbidden"
-    code = (
-        ProblemCode.UNKNOWN_OPTION
-        if unknown
-        else ProblemCode.INVALID_OPTION
-        if options
-        else ProblemCode.INVALID_REQUEST
-    )
     others = f" {len(errors) - 1} further error(s) follow." if len(errors) > 1 else ""
-    source = "/v1/options" if options else "/docs"
+    if options:
+        fault = option_fault(first)
+        hint = f"{fault.hint} Compare with the schema at /v1/options.{others}".strip()
+        code = ProblemCode[fault.code.upper()]
+        return wrong_input(code, field=fault.field, expected=fault.expected, got=fault.got, hint=hint)
+    where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", "header")]
     return wrong_input(
-        code,
-        field=field,
-        expected="a name listed at /v1/options" if unknown else expectation(first),
-        got=(f"the unknown name {where[-1]!r}" if unknown else _short(first.get("input"))),
-        hint=f"Compare with the schema at {source}.{others}",
-    )
-
-
-def _short(value: object) -> str:
-    """Return a value's text, cut to 80 characters."""
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "…"
+        ProblemCode.INVALID_REQUEST, field=".".join(where) or "request", expected=expectation(first),
+        got=shown(first.get("input")), hint=f"Compare with the schema at /docs.{others}",
+    )  # fmt: skip
 
 
 def install(app: FastAPI, table: Mapping[type[Exception], int], *, security_headers: Mapping[str, str]) -> None:

@@ -11,6 +11,7 @@ from typing import Any, get_args
 from pliant.schemas.job import Interpretation, Job, Priority
 from pliant.schemas.options import Options
 from pliant.schemas.problems import ProblemCode
+from pliant.schemas.suggestions import closest
 from pliant.service.multipart import File, Form, FormRules, own_name
 from pliant.service.problems import Refusal, from_validation, wrong_input
 from pliant.service.settings import ServiceSettings
@@ -38,6 +39,8 @@ UPLOADS = {f"{part}_upload": part for part in sorted(FILES)}
 KEPT = "inputs_of"
 """Text part with the id of a job whose stored inputs are reused."""
 TEXTS = frozenset({"mesh", "options", "name", "priority", "webhook", "webhook_secret", KEPT, *UPLOADS})
+ANY_INPUT = frozenset({"file", "files", "data", "input", "upload", "video", "points"})
+"""Common names of a part that holds the tracks or the film."""
 READING = (
     "layout", "rows", "y_axis", "coordinates", "coordinate_order", "visibility", "frames", "stride", "max_points", "min_seen",
 )  # fmt: skip
@@ -54,7 +57,18 @@ def form_rules(settings: ServiceSettings, *, max_body_bytes: int) -> FormRules:
         max_body_bytes=max_body_bytes,
         max_text_bytes=settings.max_text_bytes,
         stall_seconds=settings.stall_seconds,
+        hint=hint_of_unknown,
     )
+
+
+def hint_of_unknown(part: str) -> str:
+    """Return what to do about a part of an unknown name: an option, another word for the input, or a misspelt name."""
+    if part in Options.model_fields:
+        return f"It is an option: send it in the part options, as in curl's -F 'options={{\"{part}\": …}}'."
+    if part in ANY_INPUT:
+        return "Name the part tracks or film, as in curl's -F tracks=@tracks.npz or -F film=@film.mp4."
+    meant = closest(part, sorted(FILES | TEXTS))
+    return "Leave it out." if meant is None else f"Did you mean {meant}? If not, leave it out."
 
 
 def accept(

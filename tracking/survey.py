@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pliant.tracking.decoding.film import Film
-from pliant.tracking.errors import FilmError, TrackingStopped
+from pliant.tracking.decoding.film import LEAST_FRAMES, Film
+from pliant.tracking.errors import TrackingStopped
 from pliant.tracking.flow import Floats, Grey
 from pliant.tracking.frame_store import FrameStore
 from pliant.tracking.records import OnStep, TrackingStep
@@ -89,11 +89,8 @@ def survey(
             likeness.append(_likeness(before, small))
         before = small
         on_step(TrackingStep("read", len(indices), None))
-    if len(indices) < 3:
-        raise FilmError(
-            "too_few_frames", field="film", expected="at least 3 frames", got=str(len(indices)),
-            hint="Film two seconds or more, while the thing turns.",
-        )  # fmt: skip
+    if len(indices) < LEAST_FRAMES:
+        raise film.too_few_frames(len(indices))
     return Survey(
         np.array(indices), np.array(times), np.array(sharpness), find_cuts(np.array(likeness)),
         (np.array(size) / film.size).astype(np.float32), _ends_early(film, indices[-1]),

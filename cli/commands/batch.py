@@ -115,7 +115,7 @@ class Batch:
             Such an option was given, a file cannot be read, two files have the same name, or a folder is not writable.
         """
         from pliant.client.errors import BadArgument
-        from pliant.client.multipart import existing_file
+        from pliant.client.input_files import existing_file
 
         given = [word for word, value in (("--name", name), ("--id", job_id), ("--region", region)) if value]
         if given:

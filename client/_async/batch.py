@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pliant.client._async.job import AsyncRemoteJob, AsyncResult
 from pliant.client.errors import PliantError
-from pliant.client.multipart import Source, job_name
+from pliant.client.input_files import Source, job_name
 
 if TYPE_CHECKING:
     from pliant.client._async.client import AsyncClient

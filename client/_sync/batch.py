@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pliant.client._sync.job import RemoteJob, Result
 from pliant.client.errors import PliantError
-from pliant.client.multipart import Source, job_name
+from pliant.client.input_files import Source, job_name
 
 if TYPE_CHECKING:
     from pliant.client._sync.client import Client

@@ -22,7 +22,8 @@ from pliant.client._sync.job import RemoteJob, Result
 from pliant.client._sync.operations import OnJob
 from pliant.client.call import Call
 from pliant.client.errors import NotFound
-from pliant.client.multipart import Inputs, OnBytes, Source, option_fields
+from pliant.client.input_files import Region, Source
+from pliant.client.multipart import Inputs, OnBytes, option_fields
 from pliant.client.pauses import in_place
 from pliant.client.requests import further, sharing
 from pliant.client.result import finished, job_path, loaded, succeeded
@@ -64,7 +65,7 @@ class Client(Connection):
         tracks: Source | None = None,
         *,
         film: Path | str | None = None,
-        region: Path | str | None = None,
+        region: Region | None = None,
         visible: ArrayLike | None = None,
         mesh: Source | tuple[int, int] | None = None,
         ground_truth: Source | None = None,
@@ -89,9 +90,10 @@ class Client(Connection):
             or the path of a file in any format that the service reads.
         film : path, optional
             A film instead of tracks: mp4, mov, webm, mkv, avi, animated GIF or a zip of pictures. The job tracks its points.
-        region : path, optional
-            Region to track in the film: a mask picture of the film's size, white inside. Without it and without the option
-            `region_polygon`, the entire picture is tracked.
+        region : path or array, optional
+            Region to track in the film: a mask of the film's size, either a picture that is white inside, or an array (H, W) of
+            bool, or of uint8 with 128 and above inside. Without it and without the option `region_polygon`, the entire picture
+            is tracked.
         visible : array_like, optional
             Shape (F, P), bool or confidence in [0, 1]; only with an array of tracks.
         mesh : array_like, (rows, columns), path, optional

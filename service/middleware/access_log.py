@@ -19,6 +19,10 @@ HEADER = "X-Request-ID"
 QUIET = frozenset({"/healthz", "/readyz", "/metrics"})
 """Paths that monitoring requests every few seconds, logged at level debug unless they fail."""
 
+READINESS = "/readyz"
+"""The path whose answer 503 is an expected one: the service is starting, or waits for its store. It is logged at level info;
+what is unavailable is logged by the part that uses it."""
+
 _ALLOWED = re.compile(r"[A-Za-z0-9._:+=/-]{1,128}")
 _JOB = re.compile(r"/v1/jobs/([A-Za-z0-9_-]{3,64})")
 
@@ -69,11 +73,16 @@ class AccessLog:
 
 
 def _write(scope: Scope, kept: dict[str, str], *, status: int, seconds: float) -> None:
-    """Log one request: errors of the service at level error, refusals at warning. Status 0: the client disconnected first."""
+    """Log one request: errors of the service at level error, refusals at warning, others and those of readiness at info.
+
+    Status 0: the client disconnected first.
+    """
     # The path as it was sent, percent-encoded, so that it cannot hold a line break.
     path = bytes(scope.get("raw_path") or scope["path"].encode()).decode("ascii", "backslashreplace")[:200]
     level = logging.ERROR if status >= 500 else logging.WARNING if status >= 400 else logging.INFO
-    if level == logging.INFO and scope["path"] in QUIET:
+    if scope["path"] == READINESS and status == 503:
+        level = logging.INFO
+    elif level == logging.INFO and scope["path"] in QUIET:
         level = logging.DEBUG
     found = _JOB.match(scope["path"])
     token = scope.get("pliant.token")

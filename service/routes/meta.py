@@ -64,6 +64,7 @@ def readyz(
         return parts
     detail = " ".join(f"{name}: {sentence}" for name, sentence in missing.items())
     if core.settings.asks_for_tokens:
-        _log.warning("not ready: %s", detail)
+        # While no worker runs yet, the answer itself says so, and a start is no reason for a warning.
+        _log.log(logging.INFO if set(missing) == {"workers"} else logging.WARNING, "not ready: %s", detail)
         detail = f"Not ready: {', '.join(missing)}. The service's log has the reasons."
     raise Refusal(ProblemCode.NOT_READY, detail=detail, headers={"Retry-After": "2"})

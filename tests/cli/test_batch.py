@@ -16,7 +16,7 @@ from pliant.cli import app
 from pliant.cli.commands.batch import Batch
 from pliant.cli.exits import Exit
 from pliant.cli.session import Session
-from pliant.client.multipart import LONGEST_NAME
+from pliant.client.input_files import LONGEST_NAME
 from pliant.service.testing import InMemoryService
 from typer.testing import CliRunner, Result
 

@@ -85,6 +85,18 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
     assert "--mesh: expected tracks, got a film" in refused.output
 
 
+def test_a_folder_of_two_pictures_and_tracks_is_described_as_it_was_read(tmp_path: Path) -> None:
+    for number in range(2):
+        (tmp_path / f"{number}.png").write_bytes(films.png(np.zeros((48, 64, 3), np.uint8)))
+    np.savez(tmp_path / "tracks.npz", tracks=np.zeros((5, 9, 2)))
+    ran = CliRunner().invoke(app, ["inspect", str(tmp_path)], env={"COLUMNS": "400"})
+    assert ran.exit_code == Exit.REFUSED
+    assert (
+        f"film: expected at least 3 frames, got 2 pictures in {tmp_path.name}, read as a folder of pictures. "
+        "Add the other frames of the film. For a track file, give its own path."
+    ) in " ".join(ran.output.split())
+
+
 def copied(film: Path, folder: Path) -> Path:
     copy = folder / film.name
     copy.write_bytes(film.read_bytes())

@@ -22,7 +22,7 @@ from pliant.cli.demo import GOOD, announced, judge
 from pliant.cli.session import Session, name_of, parse_options
 from pliant.cli.solve import file_or_word
 from pliant.client import BadArgument, Unreachable
-from pliant.client.multipart import LONGEST_NAME
+from pliant.client.input_files import LONGEST_NAME
 from pliant.service.settings import ServiceSettings
 from pliant.service.testing import InMemoryService
 from pliant.worker.processes.valkey import find_binary

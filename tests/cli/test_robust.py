@@ -136,8 +136,19 @@ LISTED = "`pliant options` lists every option."
             "--status: expected one of queued, running, cancelling, succeeded, failed, cancelled, got 'done'.",
         ),
         ("submit TRACKS -O loss", f"--option: expected NAME=VALUE, got 'loss'. {LISTED}"),
-        ("solve TRACKS -o OUT -O frobnicate=1", f"options: frobnicate: there is no such option. {LISTED}"),
-        ("submit TRACKS -O los=l1", f"options: los: there is no such option (did you mean loss?). {LISTED}"),
+        (
+            "solve TRACKS -o OUT -O frobnicate=1",
+            f"options.frobnicate: expected the name of an option, got the unknown name 'frobnicate'. {LISTED}",
+        ),
+        (
+            "submit TRACKS -O los=l1",
+            f"options.los: expected the name of an option, got the unknown name 'los'. Did you mean loss? {LISTED}",
+        ),
+        (
+            "solve TRACKS -o OUT -O focal_length=800",
+            "options.focal_length: expected the name of an option, got the unknown name 'focal_length'. Did you mean focal? "
+            f"{LISTED}",
+        ),
     ],
 )
 def test_bad_paths_or_options_are_errors(run: Run, tracks: Path, tmp_path: Path, arguments: str, sentence: str) -> None:
@@ -156,7 +167,7 @@ def test_bad_paths_or_options_are_errors(run: Run, tracks: Path, tmp_path: Path,
 
     ran = run(*map(filled, arguments.split()))
     assert (ran.exit_code, ran.stdout) == (Exit.REFUSED, "")
-    code = "invalid_option" if sentence.startswith("options:") else "invalid_argument"
+    code = "unknown_option" if sentence.startswith("options.") else "invalid_argument"
     assert words(ran) == refusal(filled(sentence), code)
 
 
@@ -175,7 +186,7 @@ def test_unwritable_folders_are_rejected(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 
 def test_unreadable_files_are_rejected(run: Run, tracks: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("pliant.client.multipart.os.access", lambda *_: False)
+    monkeypatch.setattr("pliant.client.input_files.os.access", lambda *_: False)
     ran = run("solve", tracks, "-o", tmp_path / "out")
     assert ran.exit_code == Exit.REFUSED
     assert words(ran) == refusal(f"tracks: the file {tracks} cannot be read. Change its permissions.")
@@ -474,6 +485,14 @@ def test_errors_end_with_where_they_are_explained(run: Run, tracks: Path, tmp_pa
     full = OSError(28, "No space left on device")
     assert explained_at(details_of(full), None) == "pliant explain unusable_path"
     assert explained_at(details_of(KeyboardInterrupt()), None) is None, "no refusal"
+    ran = run("solve", tracks, "--mask", "m.png")
+    assert (ran.exit_code, "No such option: --mask (Possible options: --region)" in words(ran)) == (Exit.USAGE, True)
+    ran = run("solve", tracks, "--image-size", "320x240")
+    assert "It is an option of the reconstruction: -O image_size=VALUE" in words(ran)
+    ran = run("solve", tracks, "--focal-length", "800")
+    assert "An option of the reconstruction is given as -O focal=VALUE" in words(ran)
+    ran = run("up", "--loss", "l1")
+    assert "-O" not in words(ran), "it has no such options"
     ran = run("solve", tracks, "--frobnicate")
     assert ran.exit_code == Exit.USAGE
     assert "Try 'pliant solve --help' for help." in words(ran), "usage errors lead to the reference of the command"

@@ -37,6 +37,14 @@ def test_a_film_becomes_tracks_and_a_preview(tmp_path: Path) -> None:
     assert "Only 4 frames" in ran.stderr
 
 
+def test_a_file_of_tracks_is_no_film(tmp_path: Path) -> None:
+    np.savez(tmp_path / "tracks.npz", tracks=np.zeros((5, 9, 2)))
+    ran = CliRunner().invoke(app, ["track", str(tmp_path / "tracks.npz"), "-o", str(tmp_path / "out.npz"), "--json"])
+    document = json.loads(ran.stderr)
+    assert (ran.exit_code, document["code"]) == (3, "tracks_as_film")
+    assert "command line: pliant solve tracks.npz" in document["hint"]
+
+
 def test_a_file_of_the_command_is_not_replaced_by_another(tmp_path: Path) -> None:
     film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72)))
     before = film.read_bytes()

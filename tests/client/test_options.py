@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 from pliant.schemas.options import SOLVER_FIELDS, Options
+from pliant.schemas.suggestions import closest
 from pliant.solver import Settings
 
 
@@ -30,6 +32,30 @@ def test_a_principal_point_is_two_comma_separated_numbers() -> None:
     assert Options.model_validate({"principal_point": "320,240.5"}).principal_point == "320,240.5"
     with pytest.raises(ValueError, match="principal_point"):
         Options.model_validate({"principal_point": "320"})
+
+
+def test_pairs_of_numbers_are_accepted_for_texts_of_two_numbers() -> None:
+    given = Options.model_validate({"image_size": (np.int64(320), 240), "principal_point": (159.5, 119.5)})
+    assert (given.image_size, given.principal_point) == ("320x240", "159.5,119.5")
+    for wrong in ((320, 240, 3), ("a", "b"), 320, (0, 240)):
+        with pytest.raises(ValueError, match="width and height in pixels, such as 1920x1080"):
+            Options.model_validate({"image_size": wrong})
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("los", "loss"), ("focal_length", "focal"), ("image-size", "image_size"), ("imagesize", "image_size"), ("Fps", "fps"),
+        ("frobnicate", None), ("x", None), ("loss" * 50, None),
+    ],
+)  # fmt: skip
+def test_an_unknown_name_suggests_the_option_that_was_meant(given: str, meant: str | None) -> None:
+    assert closest(given, Options.model_fields) == meant
+
+
+def test_another_word_for_a_name_is_known_where_the_name_is() -> None:
+    assert closest("mask", ["mesh", "region"]) == "region"
+    assert closest("mask", ["task", "mesh"]) == "task"
 
 
 def test_an_unknown_output_is_rejected_with_the_known_names() -> None:

@@ -99,6 +99,17 @@ def test_a_film_chosen_as_tracks_moves_to_the_film_input(page: Page) -> None:
     expect(page.locator("[data-part=film]").get_by_role("alert")).to_be_visible(timeout=SOON)
 
 
+@pytest.mark.usefixtures("front")
+def test_tracks_chosen_as_a_film_move_to_the_tracks_input(page: Page, small: dict[str, bytes]) -> None:
+    page.locator("[data-part=film]").wait_for()
+    (name, data), *_ = small.items()
+    file = {"name": name, "mimeType": "application/octet-stream", "buffer": data}
+    page.get_by_label("Film", exact=True).set_input_files(file)  # type: ignore[arg-type]
+    expect(page.locator("[data-part=tracks]")).to_contain_text(name)
+    expect(page.locator("[data-part=film]")).not_to_contain_text(name)
+    expect(page.get_by_text("This browser cannot decode the film")).to_be_hidden()
+
+
 def test_a_finished_job_can_be_exported_shared_and_rerun(page: Page, url: str, finished: str) -> None:
     page.goto(f"{url}/#job={finished}")
     page.get_by_role("button", name="More files").click()

@@ -14,7 +14,7 @@ from pliant.schemas.problems import ProblemCode, explanations, find_code
 from pliant.service.problems import Refusal
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = ("solver", "tracking", "worker", "service", "client", "cli")
+FOLDERS = ("schemas", "solver", "tracking", "worker", "service", "client", "cli")
 
 
 @cache

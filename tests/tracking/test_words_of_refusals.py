@@ -19,6 +19,11 @@ from pliant.tracking import FilmError, FilmLimits, open_film, track_film
 PICTURES = films.textured_pictures(8)
 FTYP = films.box(b"ftyp", b"isom", b"\0\0\2\0", b"isom")
 EMPTY = np.zeros((48, 64), bool)
+TRACKS = (
+    "film: expected an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures, got {}, a file of "
+    "tracks. Send it as the tracks instead (on the page: under Tracks; REST: -F tracks=@tracks.npz; Python: submit('tracks.npz'); "
+    "command line: pliant solve tracks.npz)."
+)
 ODD = [(64, 48), (64, 48), (32, 48)]
 
 
@@ -126,7 +131,14 @@ CASES: dict[str, Case] = {
     "a selection that is none": Case(data=film, given={"frames": "5:2"},
         words="frames: expected a number of frames from 1, or start:stop:step with start ≥ 0, stop > start and step ≥ 1, got '5:2'. For example '0:300:2', every second of the first 300 frames."),
     "two frames": Case(data=film, given={"frames": "0:2"}, track=True,
-        words="film: expected at least 3 frames, got 2. Film two seconds or more, while the thing turns."),
+        words="film: expected at least 3 frames, got 2. Film two seconds or more, while the thing turns, or widen the selection."),
+    "two pictures": Case(name="film.zip", data=lambda path: films.zip_of(path, {f"{i}.png": films.png(np.zeros((48, 64, 3), np.uint8)) for i in range(2)}), track=True,
+        words="film: expected at least 3 frames, got 2 pictures in film.zip, read as a zip of pictures. Add the other frames of the film."),
+    "an npz of tracks": Case(name="tracks.npz", data=lambda path: np.savez(path, tracks=np.zeros((3, 4, 2))), words=TRACKS.format("tracks.npz")),
+    "an npy of tracks": Case(name="tracks.npy", data=lambda path: np.save(path, np.zeros((3, 4, 2))), words=TRACKS.format("tracks.npy")),
+    "a MATLAB file": Case(name="tracks.mat", data=b"MATLAB 5.0 MAT-file" + bytes(600), words=TRACKS.format("tracks.mat")),
+    "a MATLAB 7.3 file": Case(name="tracks.mat", data=b"MATLAB 7.3 MAT-file".ljust(512) + b"\x89HDF\r\n\x1a\n" + bytes(600), words=TRACKS.format("tracks.mat")),
+    "a table": Case(name="tracks.csv", data=b"frame,point,x,y\n0,0,1,2\n", words=TRACKS.format("tracks.csv")),
     "a frame beyond the film": Case(data=film, given={"region": ~EMPTY, "region_frame": 99}, track=True,
         words="region_frame: expected a frame number from 0 to 7, got 99. Frames are counted in the whole film from 0."),
     "a template beyond the film": Case(data=film, given={"template_frame": 99}, track=True,

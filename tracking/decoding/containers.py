@@ -26,6 +26,10 @@ MAX_STREAMS = 16
 
 MP4_BOXES = {b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot"}
 NESTED = {b"moov", b"trak", b"mdia", b"minf", b"dinf"}
+ARRAYS = (b"\x93NUMPY", b"\x89HDF", b"MATLAB 5.0")
+"""First bytes of npy, HDF5 (MATLAB 7.3, SLEAP, DeepLabCut) and MATLAB 5 files, which hold tracks."""
+TABLES = (".csv", ".tsv", ".json")
+"""Names of text files that hold tracks."""
 TEXTS = (b"#EXT", b"ffconcat", b"v=0", b"<?xml", b"<MPD", b"[playlist]", b"http", b"rtsp", b"file:")
 
 
@@ -66,6 +70,12 @@ def _recognise_stream(stream: BinaryIO, name: str) -> Container:
         return "avi"
     if head[:6] in (b"GIF87a", b"GIF89a"):
         return "gif"
+    if _holds_arrays(head, name):
+        raise _refusal(
+            "tracks_as_film", f"{name}, a file of tracks",
+            "Send it as the tracks instead (on the page: under Tracks; REST: -F tracks=@tracks.npz; Python: submit('tracks.npz'); "
+            "command line: pliant solve tracks.npz).",
+        )  # fmt: skip
     if head[:4] == b"PK\x03\x04":
         return "zip"
     if head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(TEXTS):
@@ -74,6 +84,16 @@ def _recognise_stream(stream: BinaryIO, name: str) -> Container:
             "Pass the film itself; other files and addresses are never opened.",
         )  # fmt: skip
     raise _refusal("unsupported_film", f"{name}, which is none of these", "Convert it: ffmpeg -i FILM film.mp4")
+
+
+def _holds_arrays(head: bytes, name: str) -> bool:
+    """Return whether a file holds arrays or a table rather than pictures, by its first bytes, its members or its name."""
+    if head.startswith(ARRAYS) or head[512:].startswith(b"\x89HDF"):
+        return True
+    if head.startswith(b"PK\x03\x04"):
+        length = int.from_bytes(head[26:28], "little")
+        return head[30 : 30 + length].endswith(b".npy")  # the name of the first member
+    return Path(name).suffix.lower() in TABLES and b"\0" not in head
 
 
 def _check_mp4(stream: BinaryIO, name: str) -> None:

@@ -32,6 +32,12 @@ Films that browsers record state no rate; FFmpeg then guesses one, often that of
 WIDEST_PIXEL = 4.0
 """Maximum ratio of a pixel's sides; anamorphic and broadcast formats stay below 2."""
 
+LEAST_FRAMES = 3
+"""Minimum number of frames of a film that can be tracked."""
+
+OF_PICTURES: dict[Container, str] = {"folder": "a folder of pictures", "zip": "a zip of pictures"}
+"""Films made of picture files, in words."""
+
 DEMUXERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 _OPENING = threading.Lock()
 
@@ -75,6 +81,19 @@ class Film:
     """Start, stop and step of the selected frames."""
 
     limits: FilmLimits
+
+    def too_few_frames(self, count: int) -> FilmError:
+        """Return (not raise) the error for fewer than `LEAST_FRAMES` selected frames; it states how pictures were read."""
+        kind = OF_PICTURES.get(self.container)
+        hint = "Film two seconds or more, while the thing turns" if kind is None else "Add the other frames of the film"
+        if self.selection != (0, None, 1):
+            hint += ", or widen the selection"
+        if self.container == "folder":
+            hint += ". For a track file, give its own path"
+        got = str(count) if kind is None else f"{count} pictures in {self.path.name}, read as {kind}"
+        return FilmError(
+            "too_few_frames", field="film", expected=f"at least {LEAST_FRAMES} frames", got=got, hint=f"{hint}."
+        )
 
     def frames(self) -> Generator[Frame, None, None]:
         """Decode the selected frames in order; memory does not grow with the film.

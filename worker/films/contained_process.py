@@ -38,9 +38,6 @@ FOLLOWED_POINTS = 150
 SHARES = {"read": (0.0, 0.15), "locate": (0.15, 0.25), "track": (0.25, 1.0)}
 """Start and end of each stage of the tracker, as fractions of the tracking time, from typical timings."""
 
-LEAST_FRAMES = 3
-"""Minimum number of frames of a reconstruction."""
-
 PICTURE_SIDE, PICTURE_QUALITY = 800, 80
 """Longest side in pixels and JPEG quality of the first frame in the answer: about 0.1 MB, at most 0.5 MB."""
 
@@ -91,6 +88,7 @@ def _answer(request: dict[str, Any]) -> str:
 def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
     """Open the film, decode its first frame, and read the region."""
     from pliant.tracking import FilmError, open_film
+    from pliant.tracking.decoding.film import LEAST_FRAMES
     from pliant.tracking.region import read_region
 
     options = request["options"]
@@ -103,10 +101,7 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
             hint="Select some with frames, for example 0:3000:2.",
         )  # fmt: skip
     if next(film.frames(), None) is None or (count is not None and count < LEAST_FRAMES):
-        raise FilmError(
-            "too_few_frames", field="film", expected=f"at least {LEAST_FRAMES} frames", got=str(count or 0),
-            hint="Film for longer, or widen the selection.",
-        )  # fmt: skip
+        raise film.too_few_frames(count or 0)
     region = _region(request)
     if region is not None:
         read_region(region, film.size)

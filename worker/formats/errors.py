@@ -5,14 +5,18 @@
 
 Codes of this package: ambiguous_coordinates, ambiguous_layout, damaged_file, duplicate_member, duplicate_observation, empty_file,
 member_name, missing_array, missing_image_size, no_frames_left, object_array, out_of_range, pickle_refused, too_large, too_slow,
-unknown_format, unsupported_feature, vertex_count_mismatch, wrong_shape, wrong_type.
+transposed_grid, unknown_format, unsupported_feature, vertex_count_mismatch, wrong_shape, wrong_type.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from pliant.solver import InvalidInput
+
+LISTED, LONGEST_NAME = 10, 40
+"""Numbers of arrays that an error lists, and of characters of each name."""
 
 
 class AmbiguousInput(InvalidInput):
@@ -29,6 +33,16 @@ class AmbiguousInput(InvalidInput):
     ) -> None:  # fmt: skip
         super().__init__(code, field=field, expected=expected, got=got, hint=hint)
         self.choices = choices
+
+
+def missing_array(field: str, *, expected: str, there: Mapping[str, tuple[int, ...] | None], hint: str) -> InvalidInput:
+    """Return the error for a file without the array that is needed; `there` are the names and, if known, shapes of what it has."""
+    listed = [
+        name[:LONGEST_NAME] + ("" if shape is None else f" {shape}") for name, shape in sorted(there.items())[:LISTED]
+    ]
+    more = f" and {len(there) - LISTED} more" if len(there) > LISTED else ""
+    got = ", ".join(listed) + more or "no array"
+    return InvalidInput("missing_array", field=field, expected=expected, got=got, hint=hint)
 
 
 def too_large(field: str, *, expected: str, got: str) -> InvalidInput:

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import InvalidInput, KnownCamera
-from pliant.worker.formats.reading.containers import read_arrays
+from pliant.worker.formats.errors import missing_array
+from pliant.worker.formats.reading.containers import read_arrays, shapes_in
 from pliant.worker.formats.records import MAX_COORDINATE, Arrays, Limits
 from pliant.worker.formats.tracks.interpretation import Understood
 from pliant.worker.formats.tracks.tracker_formats import TRUE_ROTATIONS, TRUE_SHAPES, short_names
@@ -56,9 +57,8 @@ def read_truth(path: Path | None, understood: Understood, *, limits: Limits) -> 
         arrays = {"shapes": arrays["array"]}
     truth = _truth_of(arrays, understood)
     if truth is None:
-        raise InvalidInput(
-            "missing_array", field="ground_truth", expected="shapes (F, P, 3) or S (3F, P)",
-            got=", ".join(sorted(arrays)[:20]) or "no array of a known name",
+        raise missing_array(
+            "ground_truth", expected="shapes (F, P, 3) or S (3F, P)", there=shapes_in(path, arrays),
             hint="Save as numpy.savez('truth.npz', shapes=shapes).",
         )  # fmt: skip
     return truth
@@ -75,9 +75,8 @@ def read_rotations(path: Path, *, num_frames: int, frames: NDArray[np.intp], lim
     arrays = short_names(read_arrays(path, field="rotations", limits=limits, wanted=CAMERA_NAMES))
     name = next((name for name in ("array", *TRUE_ROTATIONS) if name in arrays), None)
     if name is None:
-        raise InvalidInput(
-            "missing_array", field="rotations", expected="rotations (F, 3, 3)",
-            got=", ".join(sorted(arrays)[:20]) or "no array of a known name",
+        raise missing_array(
+            "rotations", expected="rotations (F, 3, 3)", there=shapes_in(path, arrays),
             hint="Save as numpy.savez('rotations.npz', rotations=rotations).",
         )  # fmt: skip
     turned = as_rotations(arrays[name], num_frames)

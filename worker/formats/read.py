@@ -14,7 +14,7 @@ from pliant.solver import InvalidInput, Mesh, Tracks
 from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.ground_truth import read_rotations, read_truth
-from pliant.worker.formats.meshes.surface import Surface, read_surface, whole_grid
+from pliant.worker.formats.meshes.surface import Surface, check_order, read_surface, whole_grid
 from pliant.worker.formats.meshes.triangulation import triangulate
 from pliant.worker.formats.reading.containers import read_arrays
 from pliant.worker.formats.records import MAX_COORDINATE, GroundTruth, Inputs, Limits, Selection
@@ -50,7 +50,7 @@ def read_inputs(
     AmbiguousInput
         Several interpretations fit; the error lists them.
     """
-    understood = understand(read_arrays(tracks, field="tracks", limits=limits, wanted=KNOWN), options)
+    understood = understand(read_arrays(tracks, field="tracks", limits=limits, wanted=KNOWN), options, file=tracks)
     film: FilmTracks | None = None
     if understood.format == OWN:
         film = read_film_tracks(tracks, shape=understood.points.shape[:2], limits=limits)
@@ -118,6 +118,7 @@ def _choose(
     if len(picked) < whole[1]:
         points, visible = points[:, picked], None if visible is None else visible[:, picked]
     _check_range(points, visible)
+    check_order(surface, points, visible)
     kept, made, how = thin(points, visible, surface.mesh, options)
     if len(kept) < len(picked):
         points, visible = points[:, kept], None if visible is None else visible[:, kept]

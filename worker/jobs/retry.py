@@ -1,4 +1,7 @@
-"""Retry of a failed or cancelled job."""
+"""Retry of a failed or cancelled job at its owner's request.
+
+The automatic repeat of a job whose worker was lost is `lifecycle.requeue`, which `maintenance.reconciler` applies.
+"""
 
 from __future__ import annotations
 

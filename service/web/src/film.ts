@@ -4,6 +4,7 @@ import { type Entry, listing, unpacked } from "./peek";
 import type { Inspection } from "./types";
 
 const FILMS = /\.(mp4|m4v|mov|webm|mkv|avi|gif|3gp)$/i;
+const TRACKS = /\.(npz|npy|mat|csv|tsv|h5|json)$/i;
 const PICTURES: [RegExp, string][] = [
   [/\.png$/i, "image/png"],
   [/\.jpe?g$/i, "image/jpeg"],
@@ -17,6 +18,11 @@ const PATIENCE = 25_000;
 export function looksLikeFilm(file: File, entries: Entry[]): boolean {
   if (file.type.startsWith("video/") || FILMS.test(file.name)) return true;
   return /\.zip$/i.test(file.name) && entries.length === 0;
+}
+
+/** Return true for a file with arrays and for a name of a track file. */
+export function looksLikeTracks(file: File, entries: Entry[]): boolean {
+  return !looksLikeFilm(file, entries) && (entries.length > 0 || TRACKS.test(file.name));
 }
 
 /** Return the first frame at the film's resolution, or null if this browser cannot decode it. */

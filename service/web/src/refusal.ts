@@ -9,6 +9,7 @@ const OURS = ["unreachable", "unknown", "no_events"];
 /** What to do on the page, where the service's hint is about requests. */
 const ON_THE_PAGE: Record<string, string> = {
   film_as_tracks: "Choose it under Film instead; its points are tracked for you.",
+  tracks_as_film: "Choose it under Tracks instead.",
   unknown_format: "Choose a file of one of these kinds; the guide shows an example of each.",
   picture_as_tracks: "Depth comes from motion: choose a film, or a zip of all its pictures, under Film.",
   member_name: "Save the file again with plain array names without folders, such as tracks and visibility.",

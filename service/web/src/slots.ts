@@ -2,7 +2,7 @@
 
 import { CameraDialog, canRecord } from "./camera";
 import { button, h, uniqueId } from "./dom";
-import { looksLikeFilm, servedFrame } from "./film";
+import { looksLikeFilm, looksLikeTracks, servedFrame } from "./film";
 import { Filming } from "./filming";
 import { type Entry, describe, peek } from "./peek";
 import type { Point } from "./region";
@@ -157,11 +157,17 @@ export class Slots {
   }
 
   private async put(part: Part, file: File | null): Promise<void> {
-    if (part === "tracks" && file !== null && this.hasFilms && looksLikeFilm(file, await peek(file))) {
-      await this.show("tracks", null);
-      await this.show("film", file);
-    } else await this.show(part, file);
+    const meant = file === null ? part : await this.meant(part, file);
+    if (meant !== part) await this.show(part, null);
+    await this.show(meant, file);
     this.onChange();
+  }
+
+  /** Return the slot for a file that was chosen for this one: films and tracks are told apart. */
+  private async meant(part: Part, file: File): Promise<Part> {
+    if (part === "tracks" && this.hasFilms && looksLikeFilm(file, await peek(file))) return "film";
+    if (part === "film" && looksLikeTracks(file, await peek(file))) return "tracks";
+    return part;
   }
 
   private async show(part: Part, file: File | null): Promise<void> {

@@ -11,8 +11,10 @@ import httpx
 import numpy as np
 import pytest
 from pliant.client import BadArgument, Client, NotLoaded, Options
-from pliant.client.multipart import Form, array_part, checked_options, existing_file, mesh_part, tracks_file
+from pliant.client.input_files import array_part, existing_file, mesh_part, region_part, tracks_file
+from pliant.client.multipart import Form, Inputs, checked_options
 from pliant.service.testing import InMemoryService
+from pliant.tracking.region import read_region
 
 POINTS = np.arange(4 * 9 * 2, dtype=np.float32).reshape(4, 9, 2)
 
@@ -90,6 +92,18 @@ def test_ground_truth_can_be_an_array_a_dictionary_or_a_file(tmp_path: Path) -> 
     assert array_part(path, "ground_truth", "shapes", tmp_path) == path
 
 
+@pytest.mark.parametrize("inside", [True, 255, 128])
+def test_a_region_can_be_an_array_or_a_file(inside: object, tmp_path: Path) -> None:
+    mask = np.zeros((24, 32), bool if inside is True else np.uint8)
+    mask[3:9, 4:20] = inside
+    path = region_part(mask, tmp_path)
+    np.testing.assert_array_equal(read_region(path, (32, 24)), read_region(mask, (32, 24)))
+    assert region_part(path, tmp_path) == region_part(str(path), tmp_path) == path
+    (tmp_path / "film.mp4").write_bytes(b"a film")
+    form = Inputs(tracks=None, film=tmp_path / "film.mp4", region=mask).form(tmp_path, {}, None)
+    assert form.files == {"film": tmp_path / "film.mp4", "region": path}
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -103,7 +117,18 @@ def test_ground_truth_can_be_an_array_a_dictionary_or_a_file(tmp_path: Path) -> 
         (lambda here: tracks_file(np.array([None]), None, here), "got dtype object"),
         (lambda here: tracks_file(POINTS * 1j, None, here), "got dtype complex"),
         (lambda here: mesh_part("3by4", here), "mesh: expected a file"),
-        (lambda here: checked_options({"loss": "l3", "los": 1}), r"loss: .*'l3'.*los: there is no such option.*loss.*pliant options"),
+        (lambda here: checked_options({"loss": "l3", "los": 1}), r"loss: .*'l3'.*los: .*mean loss\? `pliant options`"),
+        (lambda here: checked_options({"image_size": [320, 240]}), r"expected width and height in pixels, such as 1920x1080, got \[320"),
+        (lambda here: checked_options({"frames": 3}), "expected start:stop:step, such as 10:200:2, got 3"),
+        (lambda here: checked_options(5), "options: expected a mapping .* got a value of type int"),
+        (lambda here: tracks_file(object(), None, here), "tracks: expected an array of numbers or booleans, got a value of type object"),
+        (lambda here: tracks_file([[1.0], [2.0, 3.0]], None, here), "got a value of type list that is none. Pad ragged lists"),
+        (lambda here: tracks_file(b"x", None, here), "tracks: expected an array of numbers"),
+        (lambda here: mesh_part(object(), here), "mesh: expected an array of numbers or booleans, got a value of type object"),
+        (lambda here: existing_file(POINTS, "film"), "film: expected the path of a file, got a value of type ndarray"),
+        (lambda here: region_part(POINTS, here), r"region: expected the path .* of bool or uint8, got an array of shape \(4, 9, 2\)"),
+        (lambda here: region_part(POINTS[0], here), r"dtype float32\. Convert it; a polygon is the option region_polygon"),
+        (lambda here: region_part(object(), here), "region: expected an array of numbers or booleans"),
     ],
 )  # fmt: skip
 def test_invalid_inputs_are_rejected_before_anything_is_sent(make: Any, words: str, tmp_path: Path) -> None:

@@ -212,6 +212,17 @@ def test_the_timeout_covers_all_retries(clock: Clock) -> None:
     assert isinstance(caught.value, TimeoutError)
 
 
+def test_a_wait_for_the_network_that_ends_with_the_timeout_is_no_error(clock: Clock) -> None:
+    def silent(request: httpx.Request) -> httpx.Response:
+        clock.now += request.extensions["timeout"]["read"] - 0.001
+        raise httpx.ReadTimeout("timed out", request=request)
+
+    with pytest.raises(WaitTimeout, match=r"The timeout of 3 s passed during the call\. Nothing was cancelled"):
+        client_of(Flaky(silent), clock).options(timeout=3)
+    with pytest.raises(WaitTimeout, match=r"the last error was: timed out"):
+        client_of(Flaky(*[silent] * 99), clock).options(timeout=60.1)
+
+
 def test_an_error_response_is_raised_even_after_the_deadline(clock: Clock) -> None:
     def late(request: httpx.Request) -> httpx.Response:
         clock.now += 5

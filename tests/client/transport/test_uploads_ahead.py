@@ -17,13 +17,14 @@ from pliant.client.multipart import Remainder
 from pliant.service.testing import InMemoryService
 
 PATIENT = Retry(shortest_pause=0.01, longest_pause=0.05)
-POINTS = np.random.default_rng(0).normal(size=(6, 30_000, 2))
+POINTS = np.random.default_rng(0).normal(size=(6, 15_000, 2))
 
 
 @pytest.fixture(autouse=True)
 def small_is_large(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pliant.client.multipart.RESUMABLE_BYTES", 100_000)
     monkeypatch.setattr("pliant.client.multipart.SMALL", 10_000)
+    monkeypatch.setattr("pliant.client.multipart.PIECE", 1 << 17)
 
 
 @pytest.fixture
@@ -64,7 +65,7 @@ def test_an_interrupted_upload_resumes(kind: str, service_url: str, breaking: Ca
     began = breaking(3, 2)
     updates: list[int] = []
     job = submit(kind, POINTS, url=service_url, mesh="none", on_upload=lambda done, _: updates.append(done))
-    assert job.record.interpretation.num_points == 30_000
+    assert job.record.interpretation.num_points == 15_000
     assert began[0] == 0
     assert len(began) >= 4
     assert sorted(began) == began, "no try began before the one before it"
@@ -103,7 +104,7 @@ def test_a_service_without_uploads_receives_a_single_post() -> None:
     older = Older()
     assert (
         Client("http://pliant.test", transport=older).submit(POINTS, mesh="none").record.interpretation.num_points
-        == 30_000
+        == 15_000
     )
     assert [request.method for request in older.requests] == ["GET", "POST"]
 
@@ -121,7 +122,7 @@ def test_an_expired_upload_is_sent_again() -> None:
     once = Forgetful()
     assert (
         Client("http://pliant.test", transport=once).submit(POINTS, mesh="none").record.interpretation.num_points
-        == 30_000
+        == 15_000
     )
     assert [request.method for request in once.requests] == ["GET", "PUT", "POST", "GET", "PUT", "POST", "DELETE"]
     assert not [path for path in (once.folder / "uploads").rglob("*") if path.is_file()]
@@ -148,7 +149,7 @@ def test_a_job_is_returned_if_the_deadline_passes_with_the_response() -> None:
 
     service = Late()
     with Client("http://pliant.test", transport=service, retries=Retry(clock=lambda: now)) as client:
-        assert client.submit(POINTS, mesh="none", timeout=10).record.interpretation.num_points == 30_000
+        assert client.submit(POINTS, mesh="none", timeout=10).record.interpretation.num_points == 15_000
     assert [request.method for request in service.requests] == ["GET", "PUT", "POST"], "the upload is left to expire"
 
 
@@ -171,7 +172,7 @@ def test_after_an_offset_mismatch_the_offset_is_read_again(tmp_path: Path) -> No
 
     service = Jumping()
     (tmp_path / "mesh.obj").write_text("v 0 0 0\n")
-    with pytest.raises(InvalidRequest, match="expected 30000 vertices"):
+    with pytest.raises(InvalidRequest, match="expected 15000 vertices"):
         Client("http://pliant.test", transport=service, retries=PATIENT).submit(POINTS, mesh=tmp_path / "mesh.obj")
     assert [request.method for request in service.requests] == ["GET", "PUT", "GET", "PUT", "POST", "DELETE"]
     post = service.requests[-2]

@@ -53,6 +53,11 @@ def prepare(service: InMemoryService, client: httpx.Client) -> None:
     ).is_success
 
 
+PART = (
+    "{}: expected one of film, film_upload, ground_truth, ground_truth_upload, inputs_of, mesh, mesh_upload, name, options, priority, region, "
+    "region_upload, rotations, rotations_upload, tracks, tracks_upload, webhook, webhook_secret, got a part of that name. "
+)
+
 REQUESTS: dict[str, tuple[Request, str]] = {
     "no tracks": (("POST", "/v1/jobs", form(mesh="none")),
         "tracks: expected a file, got none. Add the part, as in curl's -F tracks=@tracks.npz, or a film: -F film=@film.mp4."),
@@ -73,7 +78,13 @@ REQUESTS: dict[str, tuple[Request, str]] = {
     "kept inputs of no job": (("POST", "/v1/jobs", form(inputs_of="nobody")),
         "There is no job 'nobody'. List your jobs to see which exist; expired ones are removed."),
     "an unknown part": (("POST", "/v1/jobs", form(track=TRACKS)),
-        "track: expected one of film, film_upload, ground_truth, ground_truth_upload, inputs_of, mesh, mesh_upload, name, options, priority, region, region_upload, rotations, rotations_upload, tracks, tracks_upload, webhook, webhook_secret, got a part of that name. Leave it out."),
+        PART.format("track") + "Did you mean tracks? If not, leave it out."),
+    "an option as a part": (("POST", "/v1/jobs", form(loss="huber")), PART.format("loss") + 'It is an option: send it in the part options, as in curl\'s -F \'options={"loss": …}\'.'),
+    "a file as file": (("POST", "/v1/jobs", form(file=TRACKS)), PART.format("file") + "Name the part tracks or film, as in curl's -F tracks=@tracks.npz or -F film=@film.mp4."),
+    "a mask": (("POST", "/v1/jobs", form(mask=FILM)), PART.format("mask") + "Did you mean region? If not, leave it out."),
+    "a part like no other": (("POST", "/v1/jobs", form(qwerty="1")), PART.format("qwerty") + "Leave it out."),
+    "a MATLAB file as the film": (("POST", "/v1/jobs", form(film=("tracks.mat", b"MATLAB 5.0" + bytes(600)))),
+        "film: expected an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures, got tracks.mat, a file of tracks. Send it as the tracks instead (on the page: under Tracks; REST: -F tracks=@tracks.npz; Python: submit('tracks.npz'); command line: pliant solve tracks.npz)."),
     "tracks as text": (("POST", "/v1/jobs", form(tracks="1,2,3")),
         "tracks: expected a file, got text. Give the part a file name, as in curl's -F tracks=@FILE."),
     "options that are no JSON": (("POST", "/v1/jobs", form(tracks=TRACKS, options="loss=l1")),
@@ -81,7 +92,7 @@ REQUESTS: dict[str, tuple[Request, str]] = {
     "options that are a list": (("POST", "/v1/jobs", form(tracks=TRACKS, options="[]")),
         "options: expected a JSON object, got a JSON list. For example {\"method\": \"robust\"}; the schema is at /v1/options."),
     "an unknown option": (("POST", "/v1/jobs", form(tracks=TRACKS, options='{"los": "l1"}')),
-        "options.los: expected a name listed at /v1/options, got the unknown name 'los'. Compare with the schema at /v1/options."),
+        "options.los: expected the name of an option, got the unknown name 'los'. Did you mean loss? Compare with the schema at /v1/options."),
     "an option of another value": (("POST", "/v1/jobs", form(tracks=TRACKS, options='{"loss": "l3"}')),
         "options.loss: expected 'l1', 'l2' or 'huber', got 'l3'. Compare with the schema at /v1/options."),
     "an option beyond its bounds": (("POST", "/v1/jobs", form(tracks=TRACKS, options='{"fps": 0}')),

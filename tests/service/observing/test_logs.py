@@ -83,6 +83,21 @@ def test_mapped_and_unexpected_errors_of_the_service_are_logged(
     assert "raise error" in caplog.text, "with the traceback"
 
 
+@pytest.mark.parametrize(("more", "level"), [({}, "WARNING"), ({"redis": "ok", "blobs": "ok"}, "INFO")])
+def test_a_start_without_workers_is_no_warning(
+    serve: Serve, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, more: dict[str, str], level: str
+) -> None:
+    """`pliant up` asks until all parts answer, and shows warnings. The access log never warns of this expected answer."""
+    running = serve(auth="required")
+    parts = {"redis": "The store is away.", "blobs": "ok", "workers": "No worker is running.", **more}
+    monkeypatch.setattr("pliant.worker.jobs.service.Jobs.ready", lambda _: parts)
+    assert httpx.get(f"{running.url}/readyz").status_code == 503
+    until(lambda: len(lines(caplog)) == 1)
+    assert (lines(caplog)[0].levelname, vars(lines(caplog)[0])["code"]) == ("INFO", "not_ready")
+    (reason,) = [record for record in caplog.records if record.getMessage().startswith("not ready:")]
+    assert reason.levelname == level
+
+
 def test_json_lines_carry_every_field() -> None:
     out = io.StringIO()
     handler = logging.StreamHandler(out)

@@ -15,6 +15,8 @@ from pliant.worker.formats.reading import containers
 from pliant.worker.formats.reading.parsers import PARSERS
 from pliant.worker.formats.records import Arrays
 
+pytestmark = pytest.mark.usefixtures("forked_readers")
+
 ROWS, COLUMNS, F = 5, 6, 4
 P = ROWS * COLUMNS
 FACES = Mesh.from_grid(np.arange(P).reshape(ROWS, COLUMNS)).faces
@@ -120,6 +122,22 @@ def test_a_mesh_with_another_number_of_points_is_refused(tmp_path: Path, tracks:
     assert code_of(tracks, tmp_path / "m.obj") == "vertex_count_mismatch"
     assert code_of(tracks, tmp_path / "grid.npz") == "vertex_count_mismatch"
     assert code_of(tracks, "5x7") == "vertex_count_mismatch"
+
+
+def test_a_grid_with_rows_and_columns_exchanged_is_refused(tracks: Path) -> None:
+    with pytest.raises(InvalidInput, match=f"6x5.*{ROWS}x{COLUMNS}") as caught:
+        read_inputs(tracks=tracks, mesh=f"{COLUMNS}x{ROWS}", options=Options(), limits=Limits())
+    assert caught.value.code == "transposed_grid"
+    assert caught.value.hint == f"Give mesh {ROWS}x{COLUMNS}."
+    assert read(tracks, f"{ROWS}x{COLUMNS}").interpretation.mesh_grid == (ROWS, COLUMNS)
+
+
+def test_a_grid_of_points_in_random_order_or_hidden_is_accepted(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    np.savez(tmp_path / "random.npz", tracks=sheet()[:, rng.permutation(P)])
+    np.savez(tmp_path / "hidden.npz", tracks=sheet(), visibility=np.tile(np.arange(P) % 7 == 0, (F, 1)))
+    for name in ("random.npz", "hidden.npz"):
+        assert read(tmp_path / name, f"{COLUMNS}x{ROWS}").interpretation.mesh_grid == (COLUMNS, ROWS)
 
 
 @pytest.mark.parametrize(

@@ -113,6 +113,17 @@ def test_a_table_of_observations_may_have_a_confidence_of_any_name(name: str, tm
     np.testing.assert_allclose(read.tracks.visible, np.where(SURE > 0.5, SURE, 0))
 
 
+@pytest.mark.parametrize("heads", ["Frame,ID,X,Y,Conf", "FRAME,Track_ID,x,y,conf", "frame,track_id,x,y,conf,id"])
+def test_columns_may_be_in_upper_case_and_have_other_names(heads: str, tmp_path: Path) -> None:
+    """A column named `id` beside `track_id` numbers something else."""
+    more = ",7" if heads.endswith(",id") else ""
+    rows = [f"{f},{p},{x},{y},{SURE[f, p]}{more}" for f in range(F) for p, (x, y) in enumerate(POINTS[f].tolist())]
+    (tmp_path / "tracks.csv").write_text("\n".join([heads, *rows]))
+    read = read_inputs(tracks=tmp_path / "tracks.csv", mesh="none", options=Options())
+    np.testing.assert_allclose(read.tracks.points, np.where(read.tracks.visible[..., None] > 0, POINTS, 0))
+    np.testing.assert_allclose(read.tracks.visible, np.where(SURE > 0.5, SURE, 0))
+
+
 @pytest.mark.parametrize(("mark", "encoding"), [(codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be")])
 def test_unicode_text_of_a_spreadsheet_is_read(mark: bytes, encoding: str, tmp_path: Path) -> None:
     text = one_row_a_frame("\t", ",").replace("\n", "\r\n")
@@ -214,7 +225,10 @@ def test_a_sleap_analysis_file_is_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.tracks.points[3], POINTS[3])
 
 
-FILM = "Send it as the film instead (on the page: under Film; REST: -F film=@film.mp4): its points are tracked for you."
+FILM = (
+    "Send it as the film instead (on the page: under Film; REST: -F film=@film.mp4; Python: submit(film=…)): its points are tracked "
+    "for you."
+)
 
 
 def pictures() -> bytes:

@@ -135,6 +135,20 @@ def read_npz(
     return arrays, passed_over
 
 
+def shapes_of_members(path: Path) -> dict[str, tuple[int, ...] | None]:
+    """Return names and shapes of the arrays of an npz that `read_npz` accepted; None for one that is not of numbers."""
+    shapes: dict[str, tuple[int, ...] | None] = {}
+    with zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            name = info.filename.removesuffix(".npy")
+            try:
+                with archive.open(info) as stream:
+                    shapes[name] = read_header(stream, field=name, limits=Limits())[0].shape
+            except (*UNREADABLE_ZIP, InvalidInput):
+                shapes[name] = None
+    return shapes
+
+
 def check_directory(path: Path, *, field: str) -> None:
     """Check the size of a zip's directory before the library builds an object for each of its entries."""
     size = path.stat().st_size
@@ -193,7 +207,8 @@ def film_as_tracks(got: str) -> InvalidInput:
     """Return the error for a film that was sent as tracks."""
     return InvalidInput(
             "film_as_tracks", field="tracks", expected="point tracks", got=got,
-        hint="Send it as the film instead (on the page: under Film; REST: -F film=@film.mp4): its points are tracked for you.",
+        hint="Send it as the film instead (on the page: under Film; REST: -F film=@film.mp4; Python: submit(film=…)): its points are "
+        "tracked for you.",
     )  # fmt: skip
 
 

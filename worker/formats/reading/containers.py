@@ -8,7 +8,8 @@ from pathlib import Path
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.point_names import ARRAY as NAMES
-from pliant.worker.formats.reading.arrays import NPY_MAGIC, read_file
+from pliant.worker.formats.point_names import one_line
+from pliant.worker.formats.reading.arrays import NPY_MAGIC, read_file, shapes_of_members
 from pliant.worker.formats.reading.parsers import recognise
 from pliant.worker.formats.reading.sandbox import parse_in_sandbox
 from pliant.worker.formats.records import Arrays, Limits
@@ -36,3 +37,13 @@ def read_arrays(path: Path, *, field: str, limits: Limits, wanted: Collection[st
     if head.startswith((NPY_MAGIC, *ZIP)):
         return read_file(path, field=field, limits=limits, wanted=wanted, texts=(NAMES,))
     return parse_in_sandbox(recognise(head, field), path, field=field, limits=limits)
+
+
+def shapes_in(path: Path | None, arrays: Arrays) -> dict[str, tuple[int, ...] | None]:
+    """Return names and shapes for an error that lists what a file has: the arrays read, and the other members of an npz."""
+    shapes: dict[str, tuple[int, ...] | None] = {one_line(name): array.shape for name, array in arrays.items()}
+    if path is None:
+        return shapes
+    with path.open("rb") as file:
+        is_zip = file.read(4).startswith(ZIP)
+    return shapes_of_members(path) | shapes if is_zip else shapes

@@ -30,6 +30,8 @@ UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 codecs.lookup("utf-16")  # imports the decoder now: a contained process cannot open its module later
 
 COLUMNS = ("frame", "point", "x", "y")
+POINT_NAMES = ("point", "track_id", "id")
+"""Names of the column with the number of the point; the first that a table has counts."""
 WIDE = 8
 """Number of columns from which a table without names is rejected: its rows may be frames, and its columns could mean anything."""
 
@@ -126,7 +128,7 @@ def _wide(first: str, lines: Iterator[str], *, field: str, limits: Limits, befor
         if columns is None:
             raise not_a_table(field, before, first)
     else:
-        columns = None if set(COLUMNS) <= set(split(first, separator)) else columns_of(heads[0])
+        columns = None if set(COLUMNS) <= set(_headings(first, separator)) else columns_of(heads[0])
     if columns is None:
         return None
     return read_rows(
@@ -142,7 +144,7 @@ def _columns(
     `first` is line number `before` of the file.
     """
     separator = separator_of(first)
-    heads = split(first, separator)
+    heads = _headings(first, separator)
     named = set(COLUMNS) <= set(heads)
     columns = heads if named else [*COLUMNS, "visible", *map(str, range(len(heads)))][: len(heads)]
     if len(heads) < len(COLUMNS) or (not named and len(heads) >= WIDE):
@@ -157,6 +159,13 @@ def _columns(
         if len(rows) > limits.max_bytes // 64:
             raise too_large(field, expected=f"at most {limits.max_bytes // 64:,} observations", got="more")
     return columns, rows
+
+
+def _headings(line: str, separator: str) -> list[str]:
+    """Return the names of a table's columns in lower case, that of the point's number as `point`."""
+    heads = split(line, separator)
+    of_point = next((name for name in POINT_NAMES if name in heads), None)
+    return ["point" if head == of_point else head for head in heads]
 
 
 def _row(line: str, separator: str, width: int, *, field: str, count: int) -> list[float]:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import h5py
 import numpy as np
 from pliant.solver import InvalidInput
-from pliant.worker.formats.errors import too_large
+from pliant.worker.formats.errors import missing_array, too_large
+from pliant.worker.formats.point_names import one_line
 from pliant.worker.formats.records import Arrays, Limits
 
 UNREADABLE = (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError, OverflowError, IndexError)
@@ -41,8 +42,9 @@ def read_arrays(file: h5py.File, *, field: str, limits: Limits) -> Arrays:
     found: Arrays = {}
     _collect(file, "", found, field=field, limits=limits, depth=0)
     if not found:
-        raise InvalidInput(
-            "missing_array", field=field, expected="a numeric matrix such as W", got="no plain array",
+        there = {one_line(name): getattr(file[name], "shape", None) for name in file if not name.startswith("#")}
+        raise missing_array(
+            field, expected="a numeric matrix such as W", there=there,
             hint="Save the 2F × P matrix: save('tracks.mat', 'W', '-v7').",
         )  # fmt: skip
     return found

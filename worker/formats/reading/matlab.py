@@ -13,8 +13,8 @@ from typing import IO
 import numpy as np
 import scipy.io
 from numpy.typing import NDArray
-from pliant.solver import InvalidInput
-from pliant.worker.formats.errors import damaged, too_large
+from pliant.worker.formats.errors import damaged, missing_array, too_large
+from pliant.worker.formats.point_names import one_line
 from pliant.worker.formats.records import Arrays, Limits
 
 UNREADABLE = (
@@ -56,8 +56,8 @@ def read_matlab5(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
         if not name.startswith("__"):
             _collect(name, value, found, 0)
     if not found:
-        raise InvalidInput(
-            "missing_array", field=field, expected="a numeric matrix such as W", got=f"variables {', '.join(names[:20]) or 'none'}",
+        raise missing_array(
+            field, expected="a numeric matrix such as W", there={one_line(str(name)): tuple(shape) for name, shape, _ in listed},
             hint="Save the 2F × P matrix: save('tracks.mat', 'W', '-v7').",
         )  # fmt: skip
     return found

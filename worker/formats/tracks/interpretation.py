@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import missing_array
 from pliant.worker.formats.point_names import ARRAY as NAMES
 from pliant.worker.formats.point_names import note, stated, unpack
+from pliant.worker.formats.reading.containers import shapes_in
 from pliant.worker.formats.records import Arrays
 from pliant.worker.formats.tracks.dense import flatten
 from pliant.worker.formats.tracks.layouts import Reading, choose
@@ -54,8 +57,8 @@ class Understood:
     """Names of the P points, where the file has them."""
 
 
-def understand(arrays: Arrays, options: Options) -> Understood:
-    """Interpret the arrays of a tracks file.
+def understand(arrays: Arrays, options: Options, *, file: Path | None = None) -> Understood:
+    """Interpret the arrays of a tracks file; an error also lists the arrays of `file` that were not read.
 
     Raises
     ------
@@ -65,7 +68,7 @@ def understand(arrays: Arrays, options: Options) -> Understood:
         Several interpretations fit.
     """
     named = short_names(arrays)
-    dialect, name = _recognised(named)
+    dialect, name = _recognised(named, file)
     if dialect.name == OWN:
         return _of_our_tracker(named, name, options)
     flat = flatten(name, _numeric(named[name], name))
@@ -161,12 +164,11 @@ def _projected(depths: NDArray[np.generic], reading: Reading, named: Arrays) -> 
     return Placed(points, kind, notes)
 
 
-def _recognised(named: Arrays) -> tuple[Dialect, str]:
+def _recognised(named: Arrays, file: Path | None) -> tuple[Dialect, str]:
     found = recognise(named)
     if found is None:
-        raise InvalidInput(
-            "missing_array", field="tracks", expected="an array named tracks (F, P, 2), or W (2F, P)",
-            got=", ".join(sorted(named)[:20]) or "no array of a known name",
+        raise missing_array(
+            "tracks", expected="an array named tracks (F, P, 2), or W (2F, P)", there=shapes_in(file, named),
             hint="Save as numpy.savez('tracks.npz', tracks=points, visibility=visible).",
         )  # fmt: skip
     return found

@@ -118,7 +118,7 @@ def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: 
     Raises
     ------
     InvalidInput
-        Code wrong_shape if no interpretation fits.
+        Code wrong_shape if no interpretation fits; too_few_frames or too_few_points if every one has too few.
     AmbiguousInput
         Several interpretations fit.
     """
@@ -128,6 +128,7 @@ def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: 
             "wrong_shape", field="tracks", expected="(frames, points, 2) or a matrix of 2·frames rows, with 3 frames and 4 points or more",
             got=f"{name} of shape {array.shape}", hint="Transpose or reshape the array; check the options layout and rows.",
         )  # fmt: skip
+    _check_size(name, array, allowed[0])
     if len(allowed) == 1:
         return allowed[0], []
     costs = {one.layout: roughness(one.points) for one in allowed}
@@ -144,8 +145,27 @@ def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: 
     ]
     raise AmbiguousInput(
         field="tracks", expected="tracks whose layout is certain", got=f"{name} of shape {array.shape}, which can be read as "
-        + " or ".join(one.layout for one in ranked), hint="Set the options layout and rows to the correct one.", choices=choices,
+        + " or ".join(one.layout for one in ranked), hint=f"Set the options of the correct one: {_ways(ranked)}.", choices=choices,
     )  # fmt: skip
+
+
+def _check_size(name: str, array: NDArray[np.generic], reading: Reading) -> None:
+    """Refuse an array without a reading of enough frames and points, and state how it was read, unless it was used as it is."""
+    if reading.points.shape == array.shape:
+        return  # `Tracks` refuses it, also after a selection
+    frames, count = reading.points.shape[:2]
+    what, number, least = ("frames", frames, MIN_FRAMES) if frames < MIN_FRAMES else ("points", count, MIN_POINTS)
+    if number < least:
+        raise InvalidInput(
+            "too_few_frames" if what == "frames" else "too_few_points", field="tracks", expected=f"at least {least} {what}",
+            got=f"{number} in {name} of shape {array.shape}, read as {reading.layout}",
+            hint=f"Track {'a longer clip' if what == 'frames' else 'more points'}, or save the array as (frames, points, 2).",
+        )  # fmt: skip
+
+
+def _ways(readings: list[Reading]) -> str:
+    """Return the options of each reading, in the order of the readings."""
+    return " or ".join(", ".join(f"{name}={value}" for name, value in one.options.items()) for one in readings)
 
 
 def _is_allowed(reading: Reading, options: Options) -> bool:

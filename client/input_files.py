@@ -1,0 +1,192 @@
+"""The files of a submission, written from arrays and the dictionaries of trackers, or found at a path."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from numbers import Integral
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pliant.client.errors import BadArgument
+
+Source = ArrayLike | Mapping[str, Any] | Path | str
+"""An array, a dictionary of arrays as a tracker returns it, or the path of a file."""
+
+Region = NDArray[np.bool] | NDArray[np.uint8] | Path | str
+"""A mask of a film's size: an array (H, W) of bool, or of uint8 with 128 and above inside, or the path of a picture."""
+
+LONGEST_NAME = 200
+"""Maximum length of a job's name, characters."""
+
+
+def tracks_file(tracks: Source, visible: ArrayLike | None, folder: Path) -> Path:
+    """Write the tracks to a file that the service reads; a path is used as it is.
+
+    Dictionaries are stored key by key: the service recognises the formats of trackers.
+
+    Raises
+    ------
+    BadArgument
+        `visible` was given with a file or dictionary, which have their own visibility; or a value is not an array.
+    """
+    if isinstance(tracks, str | Path):
+        refuse_visible(visible)
+        return existing_file(tracks, "tracks")
+    if isinstance(tracks, Mapping):
+        refuse_visible(visible)
+        return _npz(folder / "tracks.npz", {str(key): _array(value, str(key)) for key, value in tracks.items()})
+    hidden: NDArray[np.bool] | None = None
+    if isinstance(tracks, np.ma.MaskedArray):
+        hidden = np.asarray(np.ma.getmaskarray(tracks).any(axis=-1))
+    points = _array(np.ma.getdata(tracks) if hidden is not None else tracks, "tracks")
+    arrays = {"tracks": points}
+    if visible is not None:
+        arrays["visibility"] = _array(visible, "visible")
+    elif hidden is not None:
+        arrays["visibility"] = ~hidden
+    return _npz(folder / "tracks.npz", arrays)
+
+
+def mesh_part(mesh: Source | tuple[int, int], folder: Path) -> Path | str:
+    """Return a file of faces, or a text: a grid size such as ``"12x20"``, or ``"none"``.
+
+    Raises
+    ------
+    BadArgument
+        The mesh is neither faces, nor a file, nor such a text.
+    """
+    if isinstance(mesh, str) and re.fullmatch(r"none|\s*\d{1,6}\s*x\s*\d{1,6}\s*", mesh.lower()) is not None:
+        return mesh.lower().replace(" ", "")
+    if isinstance(mesh, str | Path):
+        return existing_file(mesh, "mesh")
+    if isinstance(mesh, tuple) and len(mesh) == 2 and all(isinstance(size, Integral) for size in mesh):
+        return f"{mesh[0]}x{mesh[1]}"
+    if isinstance(mesh, Mapping):
+        return _npz(folder / "mesh.npz", {str(key): _array(value, str(key)) for key, value in mesh.items()})
+    return _npz(folder / "mesh.npz", {"faces": _array(mesh, "mesh")})
+
+
+def region_part(region: Region, folder: Path) -> Path:
+    """Return the picture of a film's region; an array is written as PNG.
+
+    Raises
+    ------
+    BadArgument
+        The region is neither such an array nor a file.
+    """
+    if isinstance(region, str | Path):
+        return existing_file(region, "region")
+    mask = _array(region, "region")
+    if mask.ndim != 2 or mask.size == 0 or mask.dtype not in (np.dtype(bool), np.dtype(np.uint8)):
+        raise BadArgument(
+            "region: expected the path of a mask picture, or an array (H, W) of bool or uint8, got an array of shape "
+            f"{mask.shape} and dtype {mask.dtype}. Convert it; a polygon is the option region_polygon."
+        )
+    from PIL import Image  # here, because it is not needed otherwise
+
+    inside = mask if mask.dtype == bool else np.asarray(mask, dtype=np.uint8) >= 128
+    path = folder / "region.png"
+    Image.fromarray(np.where(inside, 255, 0).astype(np.uint8)).save(path)
+    return path
+
+
+def array_part(value: Source, name: str, key: str, folder: Path) -> Path:
+    """Return the file of the ground truth or of the rotations."""
+    if isinstance(value, str | Path):
+        return existing_file(value, name)
+    arrays = value if isinstance(value, Mapping) else {key: value}
+    return _npz(folder / f"{name}.npz", {str(k): _array(v, f"{name}.{k}") for k, v in arrays.items()})
+
+
+def refuse_visible(visible: ArrayLike | None) -> None:
+    """Refuse visibility beside an input that has its own.
+
+    Raises
+    ------
+    BadArgument
+        It was given.
+    """
+    if visible is not None:
+        raise BadArgument(
+            "visible: only valid with an array of tracks. A file or dictionary contains its own visibility."
+        )
+
+
+def expanded(path: Path | str, name: str) -> Path:
+    """Return a path with ``~`` or ``~user`` at its beginning expanded.
+
+    Raises
+    ------
+    BadArgument
+        There is no such user, or the user has no home directory.
+    """
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        raise BadArgument(
+            f"{name}: expected a path, got {path}, and {Path(path).parts[0]} is no user's home directory. "
+            "Write out the whole path."
+        ) from None
+
+
+def job_name(of_file: str) -> str:
+    """Return the name of a job for a file name: valid UTF-8, truncated to `LONGEST_NAME` characters."""
+    return of_file.encode("utf-8", "replace").decode()[:LONGEST_NAME]
+
+
+def existing_file(path: Path | str, name: str) -> Path:
+    """Return the path of an input, with ``~`` expanded.
+
+    Raises
+    ------
+    BadArgument
+        The value is not a path, or the file is missing, a folder, or not readable.
+    """
+    if not isinstance(path, str | Path):
+        raise BadArgument(f"{name}: expected the path of a file, got {kind_of(path)}. Give a str or a pathlib.Path.")
+    found = expanded(path, name)
+    if found.is_dir():
+        raise BadArgument(f"{name}: expected a file, got the folder {found}. Give the path of a file in it.")
+    if not found.is_file():
+        raise BadArgument(f"{name}: expected a file, an array or a dictionary of arrays, got no file at {found}.")
+    if not os.access(found, os.R_OK):
+        raise BadArgument(f"{name}: the file {found} cannot be read. Change its permissions.")
+    return found
+
+
+def _array(value: Any, name: str) -> NDArray[np.generic]:
+    """Convert anything that NumPy accepts, and PyTorch and JAX tensors on any device."""
+    for step in ("detach", "cpu"):
+        if hasattr(value, step):
+            value = getattr(value, step)()
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):  # rows of several lengths, or an object that NumPy cannot convert
+        array = np.asarray(None)
+    if array.dtype == object and not hasattr(value, "dtype"):
+        raise BadArgument(
+            f"{name}: expected an array of numbers or booleans, got {kind_of(value)} that is none. "
+            "Pad ragged lists with NaN, and give files by their path."
+        )
+    if array.dtype.kind not in "biuf":
+        raise BadArgument(
+            f"{name}: expected an array of numbers or booleans, got dtype {array.dtype}. "
+            "Pad ragged lists with NaN and omit entries that are not arrays."
+        )
+    return array
+
+
+def kind_of(value: object) -> str:
+    """Return the type of a value, in the words of an error."""
+    return f"a value of type {type(value).__name__}"
+
+
+def _npz(path: Path, arrays: Mapping[str, NDArray[np.generic]]) -> Path:
+    """Write without compression: equal arrays give equal bytes, so the service recognises a repeated submission."""
+    with path.open("wb") as file:
+        np.savez(file, **dict(arrays))  # type: ignore[arg-type]
+    return path
