@@ -13,7 +13,7 @@ from pliant.solver.cameras.perspective import Candidate, Perspective, corrected,
 from pliant.solver.evaluation.metrics import e3d_frame_scaled, focal_error, reprojection
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
-from pliant.solver.reconstruction.camera_choice import described, improbable
+from pliant.solver.reconstruction.camera_report import described, improbable
 from pliant.solver.refinement.focal_length import corrected_energy
 from pliant.solver.refinement.learned import Learned, motion_of
 from pliant.solver.shapes import perspective_shapes
