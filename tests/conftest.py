@@ -15,10 +15,14 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import certifi
 import pytest
 import typer.testing
+
+if TYPE_CHECKING:
+    from forked import Forks
 
 NANIO = shutil.which("nanio", path=f"{sysconfig.get_path('scripts')}:{Path(sys.executable).parent}")
 """A small S3 server."""
@@ -51,6 +55,23 @@ def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         patch.setenv("PLIANT_THREADS", "1")
         with running(tmp_path_factory.mktemp("service")) as url:
             yield url
+
+
+@pytest.fixture(scope="session")
+def forks() -> Iterator[Forks]:
+    """A process that has loaded what readers need."""
+    import forked
+
+    with forked.forks() as made:
+        yield made
+
+
+@pytest.fixture
+def forked_readers(forks: Forks, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read files and films in processes that are forked instead of started."""
+    import forked
+
+    forked.use(forks, monkeypatch)
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,6 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
-import forked
 import httpx
 import pytest
 import uvicorn
@@ -76,15 +75,3 @@ def running(serve: Serve) -> Running:
 def http(running: Running) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=running.url, timeout=20) as client:
         yield client
-
-
-@pytest.fixture(scope="session")
-def forks() -> Iterator[forked.Forks]:
-    with forked.forks() as made:
-        yield made
-
-
-@pytest.fixture
-def forked_readers(forks: forked.Forks, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Read files and films in processes that are forked instead of started."""
-    forked.use(forks, monkeypatch)

@@ -7,7 +7,6 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-import forked
 import pytest
 from pliant.schemas.job import Interpretation, Job
 from pliant.schemas.options import Options
@@ -121,15 +120,3 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         pytest.skip("may not mount a small file system here")
     yield disk
     subprocess.run(["umount", str(disk)], check=True)
-
-
-@pytest.fixture(scope="session")
-def forks() -> Iterator[forked.Forks]:
-    with forked.forks() as made:
-        yield made
-
-
-@pytest.fixture
-def forked_readers(forks: forked.Forks, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Read files in processes that are forked instead of started."""
-    forked.use(forks, monkeypatch)

@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
-from typing import IO, Any
+from typing import IO, Any, TypedDict, Unpack
 
 import pytest
 from pliant.worker.processes import contained
@@ -35,6 +35,27 @@ READER, SANDBOX, FILM = (
 )
 FREE = 200
 """Descriptors from here on are not used by anyone else."""
+
+
+class Streams(TypedDict):
+    """The keyword arguments of `subprocess.Popen` that `run_contained` gives."""
+
+    env: Mapping[str, str]
+    stdin: IO[bytes]
+    stdout: IO[bytes]
+    stderr: IO[bytes]
+    pass_fds: tuple[int, ...]
+    cwd: str | None
+
+
+def standard(given: Streams) -> list[int]:
+    return [given["stdin"].fileno(), given["stdout"].fileno(), given["stderr"].fileno()]
+
+
+def request_of(command: list[str], given: Streams) -> dict[str, Any]:
+    """Return what `fork` needs to know; `places` are the descriptors that the process expects."""
+    places = [0, 1, 2, *given["pass_fds"]]
+    return {"module": command[3], "env": dict(given["env"]), "cwd": given["cwd"] or str(Path.cwd()), "places": places}
 
 
 class Child:
@@ -79,28 +100,13 @@ class Forks:
             threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
             self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], env=threads)
 
-    def start(
-        self,
-        command: list[str],
-        *,
-        env: Mapping[str, str],
-        stdin: IO[bytes],
-        stdout: IO[bytes],
-        stderr: IO[bytes],
-        pass_fds: tuple[int, ...],
-        cwd: str | None,
-    ) -> Child:
+    def start(self, command: list[str], **given: Unpack[Streams]) -> Child:
         """Take the arguments of `subprocess.Popen` that `run_contained` gives."""
-        given = [stdin.fileno(), stdout.fileno(), stderr.fileno(), *pass_fds]
         status, theirs = os.pipe()
-        request = {
-            "module": command[3],
-            "env": dict(env),
-            "cwd": cwd or str(Path.cwd()),
-            "places": [0, 1, 2, *pass_fds],
-        }
+        request = request_of(command, given)
+        descriptors = [*standard(given), *given["pass_fds"], theirs]
         with self._one_at_a_time:
-            socket.send_fds(self._ours, [json.dumps(request).encode()], [*given, theirs])
+            socket.send_fds(self._ours, [json.dumps(request).encode()], descriptors)
             pid = int(self._ours.recv(100))
         os.close(theirs)
         return Child(pid, status)
@@ -198,20 +204,10 @@ class Grandchild:
         os.kill(self.pid, signal.SIGKILL)
 
 
-def forked_by_a_fork(
-    command: list[str],
-    *,
-    env: Mapping[str, str],
-    stdin: IO[bytes],
-    stdout: IO[bytes],
-    stderr: IO[bytes],
-    pass_fds: tuple[int, ...],
-    cwd: str | None,
-) -> Grandchild:
-    given = [os.dup(descriptor) for descriptor in (stdin.fileno(), stdout.fileno(), stderr.fileno(), *pass_fds)]
-    request = {"module": command[3], "env": dict(env), "cwd": cwd or str(Path.cwd()), "places": [0, 1, 2, *pass_fds]}
-    pid = fork(request, given, close=[])
-    for descriptor in given:
+def forked_by_a_fork(command: list[str], **given: Unpack[Streams]) -> Grandchild:
+    request, copies = request_of(command, given), [os.dup(each) for each in (*standard(given), *given["pass_fds"])]
+    pid = fork(request, copies, close=[])
+    for descriptor in copies:
         os.close(descriptor)
     return Grandchild(pid)
 
