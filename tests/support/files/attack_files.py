@@ -252,7 +252,8 @@ FILMS = (
     Attack("film without index", "an MP4 cut off before its index", lambda: FTYP + mp4_box(b"mdat", bytes(1 << 20)), ("truncated_film",), part="film"),
     Attack("film of huge pictures", "a zip of pictures that state 6,000 × 6,000 pixels", lambda: archive(*((f"{n}.png", LARGE_PICTURE)
            for n in range(3))), ("too_many_pixels",), part="film"),
-    Attack("film of no pictures", "a zip of tracks as film", lambda: archive(("tracks.npy", HONEST)), ("no_picture",), part="film"),
+    Attack("film of no pictures", "a zip of a text as film", lambda: archive(("notes.txt", b"nothing to see")), ("no_picture",), part="film"),
+    Attack("tracks as film", "a zip of tracks as film", lambda: archive(("tracks.npy", HONEST)), ("tracks_as_film",), part="film"),
     Attack("film of sound alone", "an MP4 whose only track is sound", lambda: FTYP + mp4_box(b"moov", mp4_box(b"trak", mp4_box(b"mdia",
            mp4_box(b"hdlr", bytes(8) + b"soun" + bytes(13))))) + mp4_box(b"mdat", bytes(1000)), ("no_picture",), part="film"),
     Attack("film of boxes", "an MP4 of 30,000 empty boxes", lambda: FTYP + mp4_box(b"free") * 30_000, ("unsupported_film",), part="film"),
