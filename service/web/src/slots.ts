@@ -163,7 +163,7 @@ export class Slots {
     this.onChange();
   }
 
-  /** Return the slot for a file that was chosen for this one: films and tracks are told apart. */
+  /** Return the part that a chosen file belongs to: film for a film chosen as tracks, tracks for the reverse. */
   private async meant(part: Part, file: File): Promise<Part> {
     if (part === "tracks" && this.hasFilms && looksLikeFilm(file, await peek(file))) return "film";
     if (part === "film" && looksLikeTracks(file, await peek(file))) return "tracks";
