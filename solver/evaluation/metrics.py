@@ -9,6 +9,8 @@ With S the reconstruction and G the ground truth, both centred in every frame:
                            Kumar et al. (2018, 2019) and later papers on dense tracks
 `e3d_frame_scaled`         a rotation per frame, one mirror and one scale k for the sequence, k least squares:
                            mean over frames of ‖k S_f Q_fᵀ − G_f‖_F / ‖G_f‖_F with k = Σ_f ⟨S_f Q_fᵀ, G_f⟩ / Σ_f ‖S_f‖²
+`size_ratio`               that k, the size of the truth divided by the result's: far from 1, their units differ, and only
+                           the two metrics above have a meaning
 `e3d_mocap`                Akhter et al. (2011), Gotardo and Martinez (2011): one Q in O(3);
                            `1/(σ F P) Σ_fp ‖Q s_fp − g_fp‖` with `σ = 1/(3F) Σ_f (σ_fx + σ_fy + σ_fz)`, the population
                            standard deviations of the true coordinates
@@ -194,7 +196,8 @@ def evaluate(
         whole = align(solution.shapes, truth, kind="sequence")
         values["e3d_sequence"] = float(whole.relative.mean())
         values["e3d_frame"] = e3d_frame(solution.shapes, truth)
-        values["e3d_frame_scaled"] = e3d_frame_scaled(solution.shapes, truth)
+        scaled = align(solution.shapes, truth, kind="frame_scaled")
+        values["e3d_frame_scaled"], values["size_ratio"] = float(scaled.relative.mean()), float(scaled.scales.mean())
         values["e3d_frame_similarity"] = e3d_frame_similarity(solution.shapes, truth)
         values["e3d_mocap"] = _mocap(whole)
         if solution.shapes_std is not None:

@@ -12,12 +12,11 @@ from pliant.solver.cameras.perspective import Perspective, corrected_moments, de
 from pliant.solver.cameras.planar_ambiguity import is_planar
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.model.so3 import MIRROR, exponential, logarithm
+from pliant.solver.model.so3 import MIRROR
 from pliant.solver.records import Floats, read_only
 from pliant.solver.refinement.depth_alternation import alternated, factorized_again
 from pliant.solver.refinement.focal_length import search
-from pliant.solver.refinement.learned import Learned
-from pliant.solver.tracks.frame_selection import between
+from pliant.solver.refinement.learned import Learned, stretched
 from pliant.solver.tracks.normalization import Normalized
 
 RESTARTS = 3
@@ -25,7 +24,7 @@ RESTARTS = 3
 
 MIN_GAIN = 0.01
 """Decrease of the energy, per point and frame, below which no further restart is tried: equal solutions from different starts differ by
-as much (`focal_length.MIN_PERSPECTIVE_GAIN`)."""
+as much."""
 
 
 def settled(
@@ -60,20 +59,18 @@ def settled(
         estimate.perspective, filling=estimate.filling, sample=estimate.sample + shift[:, None]
     )  # fmt: skip
     rotations, scales = np.asarray(estimate.rotations), np.asarray(estimate.scales)
-    view, covariance = search(
-        view.sample[used], rotations[used], scales[used], view, model_order=model_order, should_stop=should_stop
-    )
+    view, found = search(
+        view.sample[used], rotations[used], scales[used], view,
+        model_order=model_order, turning=turning, should_stop=should_stop,
+    )  # fmt: skip
     if not view.bends:
         return replace(estimate, perspective=view)
     if view.curvature * view.signs[0] < 0:
         view = replace(view, curvature=-view.curvature, flipped=-1)
-        covariance = mirrored(rotations, covariance)[1]
-        rotations = MIRROR @ rotations @ MIRROR
-        estimate = replace(estimate, rotations=rotations)
-    found, view = alternated(
-        view, Learned(rotations[used], scales[used], covariance, np.inf), used,
-        model_order=model_order, turning=turning, should_stop=should_stop,
-    )  # fmt: skip
+        turned, covariance = mirrored(found.rotations, found.covariance)
+        found = replace(found, rotations=turned, covariance=covariance)
+        estimate = replace(estimate, rotations=MIRROR @ rotations @ MIRROR)
+    found, view = alternated(view, found, used, model_order=model_order, turning=turning, should_stop=should_stop)
     settled_estimate = _applied(estimate, normalized, used, found, view)
     if not turning or is_planar(settled_estimate.gram):
         return settled_estimate
@@ -149,15 +146,10 @@ def _applied(
     estimate: CameraEstimate, normalized: Normalized, used: NDArray[np.intp], found: Learned, view: Perspective
 ) -> CameraEstimate:
     """Return the estimate with the rotations found, and with Gram matrix, sample and translations of the corrected tracks."""
-    frames = len(normalized.points)
-    before = np.asarray(estimate.rotations)
-    turns = logarithm(found.rotations @ before[used].transpose(0, 2, 1))
-    rotations = exponential(between(used, turns, frames)) @ before
-    scales = np.exp(between(used, np.log(found.scales)[:, None], frames)[:, 0])
-    covariance = found.covariance if len(used) == frames else found.covariance.stretched(used, frames)
-    view = replace(view, depth=depth_map(rotations, scales, covariance))
+    every = stretched(found, used, np.asarray(estimate.rotations))
+    view = replace(view, depth=depth_map(every.rotations, every.scales, every.covariance))
     gram, translations, sample = corrected_moments(view, normalized)
-    read_only(rotations)
+    read_only(every.rotations)
     return replace(
-        estimate, rotations=rotations, gram=gram, translations=translations, sample=sample, perspective=view
+        estimate, rotations=every.rotations, gram=gram, translations=translations, sample=sample, perspective=view
     )  # fmt: skip

@@ -6,11 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.solver.model.expectation_maximisation import learned
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, fit, metric_of, root_of
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import AXIS_VARIANCE_FLOOR, NOISE_VARIANCE_FLOOR, ShapeCovariance
+from pliant.solver.model.so3 import exponential, logarithm
 from pliant.solver.records import Floats
+from pliant.solver.tracks.frame_selection import between
 
 REFINEMENT_PRIOR_WEIGHT = 0.01
 """Weight of the camera-motion prior: less is needed once the covariance is known."""
@@ -117,6 +120,22 @@ def learned_at(
         should_stop=should_stop,
     )
     return Learned(rotations, scales, covariance, np.inf)
+
+
+def stretched(found: Learned, used: NDArray[np.intp], rotations: Floats) -> Learned:
+    """Return cameras and covariance of all frames, given those at the frames used and previous rotations of all frames.
+
+    Changes of rotation, logarithms of scales and modes are interpolated.
+    """
+    if len(used) == len(rotations):
+        return found
+    turns = logarithm(found.rotations @ rotations[used].transpose(0, 2, 1))
+    return Learned(
+        exponential(between(used, turns, len(rotations))) @ rotations,
+        np.exp(between(used, np.log(found.scales)[:, None], len(rotations))[:, 0]),
+        found.covariance.stretched(used, len(rotations)),
+        found.energy,
+    )
 
 
 def turned(

@@ -167,13 +167,21 @@ def test_evaluate_names_what_the_inputs_allow():
     rotations = np.tile(np.eye(3), (6, 1, 1))
     fit = {"reprojection_median", "reprojection_rms"}
     assert set(evaluate(solution_of(TRUTH), tracks)) == fit
-    shapes = {"e3d_sequence", "e3d_frame", "e3d_frame_scaled", "e3d_frame_similarity", "e3d_mocap"}
+    shapes = {"e3d_sequence", "e3d_frame", "e3d_frame_scaled", "e3d_frame_similarity", "e3d_mocap", "size_ratio"}
     both = evaluate(solution_of(TRUTH), tracks, TRUTH, rotations)
     assert set(both) == fit | shapes | {"rotation_degrees"}
+    assert both.pop("size_ratio") == pytest.approx(1)
     assert max(both.values()) < 1e-12
     off = evaluate(solution_of(TRUTH + 0.1 * random.standard_normal(TRUTH.shape)), tracks, TRUTH)
     assert off["e3d_sequence"] == pytest.approx(0.1, rel=0.2)
     assert off["reprojection_rms"] == pytest.approx(0.1 * np.sqrt(2), rel=0.2)
+
+
+def test_a_truth_in_another_unit_shows_in_the_size_ratio_and_not_in_the_scaled_error():
+    found = evaluate(solution_of(TRUTH), Tracks.from_arrays(TRUTH[..., :2]), TRUTH / 1000)
+    assert found["size_ratio"] == pytest.approx(1e-3)
+    assert found["e3d_frame_scaled"] < 1e-12
+    assert found["e3d_frame"] > 100
 
 
 @pytest.mark.parametrize(
