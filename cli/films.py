@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pliant.cli.session import LINE_EVERY
-from pliant.cli.show import out
+from pliant.cli.show import out, show_warnings
 
 if TYPE_CHECKING:
+    from pliant.schemas.options import Options
     from pliant.worker.films.tracker import FilmFacts
     from pliant.worker.jobs.finished import Finished
 
@@ -53,9 +55,11 @@ def inspect_film(film: Path, *, region: Path | None, options: dict[str, Any], as
     from pliant.worker.films.tracker import check_film
     from pliant.worker.settings import usable_cores
 
-    facts = check_film(FilmSource(film, region), checked_options(options), estimate=True, threads=usable_cores())
+    checked = checked_options(options)
+    facts = check_film(FilmSource(film, region), checked, estimate=True, threads=usable_cores())
+    warnings = warnings_of_check(facts, region, checked)
     if as_json:
-        print_json(facts.model_dump(mode="json"))
+        print_json(facts.model_dump(mode="json") | {"warnings": warnings})
         return
     from rich.table import Table
     from rich.text import Text
@@ -64,6 +68,14 @@ def inspect_film(film: Path, *, region: Path | None, options: dict[str, Any], as
     for name, words in film_rows(facts):
         table.add_row(Text(name, "dim"), Text(words))
     out().print(table)
+    show_warnings(warnings)
+
+
+def warnings_of_check(facts: FilmFacts, region: Path | None, options: Options) -> list[str]:
+    """Return the tracker's warnings that are known from a film's check."""
+    from pliant.tracking.advice import warnings_unread
+
+    return warnings_unread(whole=region is None and options.region_polygon is None, frames=facts.frames)
 
 
 def film_rows(facts: FilmFacts) -> list[tuple[str, str]]:
@@ -92,6 +104,8 @@ def solve_film(
 ) -> Finished:  # fmt: skip
     """Track and reconstruct a film; also write `tracks.npz` and `contact_sheet.jpg`.
 
+    Warnings that are known beforehand are printed first and left out of the returned ones, so that none is printed twice.
+
     Raises
     ------
     InvalidInput
@@ -108,14 +122,17 @@ def solve_film(
     source, checked = FilmSource(film, region), checked_options(options)
     facts = check_film(source, checked)
     checked = film_options(checked, facts)
+    printed = [] if as_json else warnings_of_check(facts, region, checked)
     if not as_json:
         out().print(described(facts, checked).notes[0], markup=False, highlight=False)
+        show_warnings(printed)
     with (
         tempfile.TemporaryDirectory(prefix="pliant-film-") as scratch,
         progress_bar(line_every=LINE_EVERY) as bar,
         threads_limited(threads),
     ):
-        return reconstruct_film(
+        done = reconstruct_film(
             source, checked, output, scratch=Path(scratch), name=name, threads=threads or usable_cores(),
             on_progress=bar.on_step,
         )  # fmt: skip
+    return replace(done, warnings=tuple(each for each in done.warnings if each not in printed))

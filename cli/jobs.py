@@ -191,8 +191,6 @@ def list_jobs(
     as_json: Json = False,
 ) -> None:
     """List jobs, newest first."""
-    from itertools import islice
-
     from pliant.client.errors import BadArgument
     from pliant.schemas.job import Status
 
@@ -200,8 +198,8 @@ def list_jobs(
     if len(unknown) > 0:
         raise BadArgument(f"--status: expected one of {', '.join(Status)}, got {unknown[0]!r}.")
     with ctx.obj.client(url, as_json=as_json) as client:
-        jobs = client.list(statuses=status or (), page_size=min(limit, 100))
-        show_jobs([job.record for job in islice(jobs, limit)], as_json=as_json)
+        jobs = client.list(statuses=status or (), limit=limit, page_size=100)
+        show_jobs([job.record for job in jobs], as_json=as_json)
 
 
 def log(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) -> None:

@@ -21,6 +21,9 @@ COLOURS = {
 
 VERDICTS = {"good": ("Good", "green"), "with_care": ("Use with care", "yellow"), "do_not_use": ("Do not use", "red")}
 
+UNESTIMATED = "The error is not estimated"
+"""Beginning of the sentence on trust if the prior has no posterior, as on the page (`service/web/src/verdict.ts`)."""
+
 
 def out() -> Console:
     """Console on standard output; created per call, so that it follows redirections."""
@@ -28,11 +31,12 @@ def out() -> Console:
 
 
 METRIC_MEANINGS: Mapping[str, str] = {
-    "e3d_frame": "3-D error: distance from the ground truth after the best rotation of each frame; share of the object's size",
-    "e3d_frame_scaled": "the same after one scale for the whole sequence",
+    "e3d_frame_scaled": "3-D error: distance from the ground truth after rotating each frame and scaling all; share of the object's size",
+    "e3d_frame": "the same without the scale; result and ground truth must have one unit",
     "e3d_sequence": "the same after one orthogonal alignment for the whole sequence",
     "e3d_frame_similarity": "the same after rotating, mirroring and scaling each frame to fit",
     "e3d_mocap": "as the motion capture literature defines it; share of the shape's spread",
+    "size_ratio": "size of the ground truth divided by the result's; far from 1, their units differ and only scaled errors have a meaning",
     "coverage": "share of the positions within their 90 % interval",
     "reprojection_median": "median distance from a visible track to the projected shape, in the tracks' unit",
     "reprojection_rms": "root mean square of the same distances; sensitive to outliers",
@@ -45,6 +49,13 @@ METRIC_MEANINGS: Mapping[str, str] = {
 def err() -> Console:
     """Console on standard error, for everything but the command's output."""
     return Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def show_warnings(warnings: Iterable[str], screen: Console | None = None) -> None:
+    """Print warnings, by default on standard error."""
+    screen = screen or err()
+    for warning in warnings:
+        screen.print(Text.assemble(("warning ", "yellow"), warning))
 
 
 def print_json(value: object) -> None:
@@ -138,11 +149,19 @@ def verdict_lines(result: Job | Finished) -> list[Text]:
     """Return the lines with the verdict and its reasons; empty if there is no verdict."""
     if result.verdict is None:
         return []
-    words, colour = VERDICTS.get(result.verdict, (result.verdict, "yellow"))
+    words, colour = _verdict(result)
     sentences = " ".join(sentence for sentence in (result.trust_sentence, result.sentence) if sentence is not None)
     return [Text.assemble((words, f"bold {colour}"), f"  {sentences}")] + [
         Text(f"  {reason}") for reason in result.verdict_reasons
     ]
+
+
+def _verdict(result: Job | Finished) -> tuple[str, str]:
+    """Return the verdict in words and its colour; without an estimate of the error, the words say so, in no colour."""
+    words, colour = VERDICTS.get(result.verdict or "", (result.verdict or "", "yellow"))
+    if result.verdict is not None and (result.trust_sentence or "").startswith(UNESTIMATED):
+        return f"{words}, error not estimated", ""
+    return words, colour
 
 
 def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
@@ -169,7 +188,7 @@ def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
 
 
 def metrics_table(metrics: Mapping[str, float]) -> Table:
-    """Return a table of the metrics and their meanings, `e3d_frame` first."""
+    """Return a table of the metrics and their meanings, `e3d_frame_scaled` first."""
     table = Table("metric")
     table.add_column("value", justify="right")
     table.add_column("meaning")
@@ -188,18 +207,26 @@ def show_jobs(jobs: Iterable[Job], *, as_json: bool) -> None:
     if as_json:
         print_json([job.model_dump(mode="json") for job in jobs])
         return
-    table = Table(box=None, pad_edge=False)
-    listed = list(jobs)
-    # Ids stay complete, so that they can be copied: on narrow terminals and in pipes the other columns shrink.
-    table.add_column("id", no_wrap=True, min_width=max((len(job.id) for job in listed), default=0))
-    for heading in ("status", "verdict", "progress", "created", "frames × points", "name"):
-        table.add_column(heading)
-    for job in listed:
-        progress = "" if job.progress is None or job.status.final else f"{job.progress.fraction:.0%}"
-        size = f"{job.interpretation.num_frames} × {job.interpretation.num_points}"
-        created = f"{job.created_at.astimezone():%Y-%m-%d %H:%M:%S}"
-        verdict = Text(*VERDICTS.get(job.verdict or "", ("", "")))
-        table.add_row(job.id, Text(job.status, COLOURS[job.status]), verdict, progress, created, size, Text(job.name))
+    rows = [
+        (
+            job.id,
+            Text(job.status if job.progress is None or job.status.final else f"{job.status} {job.progress.fraction:.0%}",
+                 COLOURS[job.status]),
+            f"{job.created_at.astimezone():%Y-%m-%d %H:%M}",
+            Text(*_verdict(job)),
+            f"{job.interpretation.num_frames} × {job.interpretation.num_points}",
+            Text(job.name),
+        )
+        for job in jobs
+    ]  # fmt: skip
+    table = Table(box=None, padding=(0, 1, 0, 0))
+    # On narrow terminals and in pipes the last columns wrap: the others, among them ids to copy, stay complete.
+    for number, heading in enumerate(("id", "status", "created")):
+        table.add_column(heading, no_wrap=True, min_width=max((len(row[number]) for row in rows), default=0))
+    for heading in ("verdict", "frames × points", "name"):
+        table.add_column(heading, overflow="fold", min_width=8)
+    for row in rows:
+        table.add_row(*row)
     out().print(table)
 
 

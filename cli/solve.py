@@ -23,7 +23,7 @@ from pliant.cli.session import (
     one_numerical_thread,
     parse_options,
 )
-from pliant.cli.show import err, metrics_table, out, print_json, understood, verdict_lines
+from pliant.cli.show import metrics_table, out, print_json, show_warnings, understood, verdict_lines
 
 if TYPE_CHECKING:
     from pliant.schemas.job import Interpretation
@@ -161,8 +161,7 @@ def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:
     from rich.text import Text
 
     screen = out()
-    for warning in done.warnings:
-        err().print(f"[yellow]warning[/yellow] {warning}")
+    show_warnings(done.warnings)
     screen.print(metrics_table(done.metrics))
     for artifact in done.artifacts:
         screen.print(f"{output / artifact.name}  {artifact.bytes / 1e6:.2f} MB", markup=False)

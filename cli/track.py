@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from pliant.cli.paths import input_file, output_file, written_aside
 from pliant.cli.session import LINE_EVERY, Force, Json, one_numerical_thread
-from pliant.cli.show import err, out, print_json
+from pliant.cli.show import err, out, print_json, show_warnings
 
 if TYPE_CHECKING:
     from pliant.tracking import OnStep, TrackedFilm, TrackingStep
+    from rich.console import Console
 
 
 Film = Annotated[
@@ -57,22 +58,41 @@ def track(
         others.append(path)
     from pliant.tracking import track_film
 
-    with _bars() as on_step:
+    shown = 0
+    with _bars() as (on_step, screen):
+
+        def on_warnings(warnings: list[str]) -> None:
+            nonlocal shown
+            if not as_json:
+                show_warnings(warnings[shown:], screen)
+                shown = len(warnings)
+
         tracked = track_film(
             film, region=region, region_frame=region_frame, template_frame=template_frame, frames=frames,
-            grid_step=grid_step, on_step=on_step,
+            grid_step=grid_step, on_step=on_step, on_warnings=on_warnings,
         )  # fmt: skip
     with written_aside(output) as aside:
         tracked.save_npz(aside)
     if preview is not None:
         with written_aside(preview) as aside:
             aside.write_bytes(tracked.contact_sheet())
-    _show(tracked, output, as_json=as_json)
+    if as_json:
+        _print_json(tracked, output, preview)
+        return
+    show_warnings(tracked.warnings[shown:])
+    count, points = tracked.visibility.shape
+    seen = f"visible in {tracked.visibility.mean():.0%}"
+    out().print(f"{output}: {points} points in {count} frames, {seen}.", markup=False)
+    if preview is not None:
+        out().print(f"{preview}: the tracks over {len(tracked.thumbnails)} of the frames.", markup=False)
 
 
 @contextmanager
-def _bars() -> Iterator[OnStep]:
-    """Show one bar for each stage on a terminal, print a line every `LINE_EVERY` seconds elsewhere."""
+def _bars() -> Iterator[tuple[OnStep, Console]]:
+    """Show one bar for each stage on a terminal, print a line every `LINE_EVERY` seconds elsewhere.
+
+    The console prints above the bars.
+    """
     from contextlib import nullcontext
 
     from pliant.client.progress import printed_lines
@@ -90,21 +110,15 @@ def _bars() -> Iterator[OnStep]:
                 tasks[step.stage] = progress.add_task(step.stage, total=step.total)
             progress.update(tasks[step.stage], completed=step.done, total=step.total)
 
-        yield on_step
+        yield on_step, screen
 
 
-def _show(tracked: TrackedFilm, output: Path, *, as_json: bool) -> None:
+def _print_json(tracked: TrackedFilm, output: Path, preview: Path | None) -> None:
     count, points = tracked.visibility.shape
-    if as_json:
-        print_json(
-            {
-                "file": str(output), "frames": count, "points": points, "visible": float(tracked.visibility.mean()),
-                "template_frame": int(tracked.film.frame_indices[tracked.template]), "warnings": list(tracked.warnings),
-            }
-        )  # fmt: skip
-        return
-    for warning in tracked.warnings:
-        err().print(f"[yellow]Warning:[/yellow] {warning}")
-    out().print(
-        f"{output}: {points} points in {count} frames, visible in {tracked.visibility.mean():.0%}.", markup=False
-    )
+    print_json(
+        {
+            "file": str(output), "preview": None if preview is None else str(preview), "frames": count, "points": points,
+            "visible": float(tracked.visibility.mean()), "template_frame": int(tracked.film.frame_indices[tracked.template]),
+            "warnings": list(tracked.warnings),
+        }
+    )  # fmt: skip

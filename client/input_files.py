@@ -19,6 +19,9 @@ Source = ArrayLike | Mapping[str, Any] | Path | str
 Region = NDArray[np.bool] | NDArray[np.uint8] | Path | str
 """A mask of a film's size: an array (H, W) of bool, or of uint8 with 128 and above inside, or the path of a picture."""
 
+EXPECTED = {"film": "the path of a film", "region": "the path of a mask picture, or an array (H, W)"}
+"""What an input may be that is no array or dictionary of arrays."""
+
 LONGEST_NAME = 200
 """Maximum length of a job's name, characters."""
 
@@ -152,7 +155,8 @@ def existing_file(path: Path | str, name: str) -> Path:
     if found.is_dir():
         raise BadArgument(f"{name}: expected a file, got the folder {found}. Give the path of a file in it.")
     if not found.is_file():
-        raise BadArgument(f"{name}: expected a file, an array or a dictionary of arrays, got no file at {found}.")
+        expected = EXPECTED.get(name, "a file, an array or a dictionary of arrays")
+        raise BadArgument(f"{name}: expected {expected}, got no file at {found}. Check the path.")
     if not os.access(found, os.R_OK):
         raise BadArgument(f"{name}: the file {found} cannot be read. Change its permissions.")
     return found

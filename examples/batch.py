@@ -9,6 +9,8 @@ from pathlib import Path
 from pliant import Client
 from pliant.client import InvalidRequest, JobEnded
 
+if len(sys.argv) < 3:
+    sys.exit(__doc__)
 folder, out = Path(sys.argv[1]), Path(sys.argv[2])
 
 with Client() as client:

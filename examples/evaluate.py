@@ -11,6 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from pliant import Client
 
+if len(sys.argv) < 3:
+    sys.exit(__doc__)
 tracks, truth, target = sys.argv[1], sys.argv[2], sys.argv[3] if len(sys.argv) > 3 else "error.png"
 
 with Client() as client:

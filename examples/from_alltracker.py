@@ -16,6 +16,8 @@ from pliant.client.progress import progress_bar
 
 POINTS = 4000  # takes minutes on two cores; more points take longer
 
+if len(sys.argv) < 3:
+    sys.exit(__doc__)
 source, mask_file = sys.argv[1], sys.argv[2]
 target = sys.argv[3] if len(sys.argv) > 3 else "alltracker.glb"
 arrays = dict(np.load(source))

@@ -12,6 +12,8 @@ import numpy as np
 from pliant import Client
 from pliant.client.progress import progress_bar
 
+if len(sys.argv) < 2:
+    sys.exit(__doc__)
 source, target = sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "cotracker.glb"
 tracker_output = dict(np.load(source))  # in a tracking script: {"pred_tracks": …, "pred_visibility": …}; tensors, too
 

@@ -9,6 +9,8 @@ import sys
 import numpy as np
 from pliant import Client
 
+if len(sys.argv) < 2:
+    sys.exit(__doc__)
 source, target = sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "shapes.npz"
 
 with Client() as client:

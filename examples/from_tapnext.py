@@ -15,6 +15,8 @@ from pliant.client.progress import progress_bar
 
 MODEL_SIZE = 256  # side of the model's input picture in pixels; change it if yours differs
 
+if len(sys.argv) < 3:
+    sys.exit(__doc__)
 source, size = sys.argv[1], sys.argv[2]
 target = sys.argv[3] if len(sys.argv) > 3 else "tapnext.glb"
 width, height = (int(side) for side in size.split("x"))

@@ -25,4 +25,6 @@ async def main() -> None:
             print(line)
 
 
+if len(sys.argv) < 2:
+    sys.exit(__doc__)
 asyncio.run(main())

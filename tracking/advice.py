@@ -17,27 +17,34 @@ UNEVEN = 1.5
 """Ratio of longest to median time between frames above which the rate counts as variable."""
 
 
-def warnings_before(film: Film, found: Survey, start: int, stop: int, *, whole: bool, rough: float) -> list[str]:
-    """Return warnings about the film in rows `start` to `stop`: region, shots, length, frame rate, and texture in a share `rough`."""
+def warnings_unread(*, whole: bool = False, frames: int = 0) -> list[str]:
+    """Return the warnings that need no look at the pictures: `whole` if there is no region, `frames` to track, 0 if unknown."""
     notes = []
     if whole:
         notes.append(
-            "No region was given, so everything in the picture is tracked, background included. Draw around the thing."
+            "No region was given, so everything in the picture is tracked, background included. Draw around the object."
         )
+    if 0 < frames < FEW_FRAMES:
+        notes.append(f"Only {frames} frames are tracked. Film two seconds or more, while the object turns.")
+    return notes
+
+
+def warnings_before(film: Film, found: Survey, start: int, stop: int, *, whole: bool, rough: float) -> list[str]:
+    """Return warnings about the film in rows `start` to `stop`: region, shots, length, frame rate, and texture in a share `rough`."""
+    notes = warnings_unread(whole=whole)
     if found.cuts:
         count, first = len(found.cuts), found.indices[found.cuts[0]]
         cuts = f"a cut (at frame {first})" if count == 1 else f"{count} cuts (the first at frame {first})"
         notes.append(
             f"The film has {cuts}. Only frames {found.indices[start]} to {found.indices[stop - 1]} are tracked. "
-            "Film the thing in one take."
+            "Film the object in one take."
         )
     if found.broken_tail:
         notes.append(
             f"The film states {film.stated_frames} frames but ends after {found.indices[-1] + 1}: it was trimmed, or its end is "
             "damaged or missing."
         )
-    if stop - start < FEW_FRAMES:
-        notes.append(f"Only {stop - start} frames are tracked. Film two seconds or more, while the thing turns.")
+    notes += warnings_unread(frames=stop - start)
     steps = np.diff(found.times[start:stop])
     if film.container in ("mp4", "matroska", "avi", "gif") and steps.max() > UNEVEN * np.median(steps):
         notes.append("The time between frames varies; frame_times holds the true times.")
@@ -58,12 +65,12 @@ def warnings_of(tracks: NDArray[np.float32], visible: NDArray[np.bool_], templat
         np.maximum(moved, np.linalg.norm(points - tracks[template], axis=1), out=moved, where=seen)
     if np.median(moved) < STILL_SHARE * size:
         notes.append(
-            "Nothing moves in this film, so it holds no information about depth. Turn the thing by 30° or more to both sides, "
+            "Nothing moves in this film, so it holds no information about depth. Turn the object by 30° or more to both sides, "
             "or walk around it."
         )
     if visible.mean() < 0.5:
         notes.append(
-            f"The points are visible in only {visible.mean():.0%} of the frames. Turn the thing less far, keep hands out of the "
+            f"The points are visible in only {visible.mean():.0%} of the frames. Turn the object less far, keep hands out of the "
             "picture, or move more slowly."
         )
     return notes

@@ -15,6 +15,12 @@ ACROSS = 20
 TAIL = 6
 """Number of past frames of each track that are drawn."""
 
+View = tuple[int, int, int, int]
+"""A rectangle of the picture: first column and row, width and height in pixels of the film."""
+
+MARGIN = 0.15
+"""Width of the surroundings that are shown on every side of the points, share of the points' extent."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sheet:
@@ -27,8 +33,20 @@ class Sheet:
     grid: NDArray[np.int32]
     template: int
     frame_times: NDArray[np.float64]
-    width: int
-    """Width of the film in pixels."""
+    thumbnail_view: View
+
+
+def view_of(tracks: NDArray[np.float32], visible: NDArray[np.bool_], size: tuple[int, int]) -> View:
+    """Return the smallest rectangle with the picture's aspect ratio that shows all visible points of all frames, and a margin."""
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for points, seen in zip(tracks, visible, strict=True):  # one frame at a time, to save memory
+        low = points.min(axis=0, where=seen[:, None], initial=np.inf).clip(max=low)
+        high = points.max(axis=0, where=seen[:, None], initial=-np.inf).clip(min=high)
+    whole = np.array(size)
+    share = min(1.0, float(((high - low + 1) * (1 + 2 * MARGIN) / whole).max()))
+    extent = np.maximum(1, np.round(share * whole)).astype(int)
+    start = np.clip(np.round((low + high + 1 - extent) / 2), 0, whole - extent).astype(int)
+    return int(start[0]), int(start[1]), int(extent[0]), int(extent[1])
 
 
 def draw_contact_sheet(sheet: Sheet, *, quality: int = 85) -> bytes:
@@ -48,12 +66,13 @@ def draw_contact_sheet(sheet: Sheet, *, quality: int = 85) -> bytes:
 
 def _draw(picture: NDArray[np.uint8], frame: int, sheet: Sheet, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
     canvas = picture.copy()
-    scale = canvas.shape[1] / sheet.width
+    left, top, width, height = sheet.thumbnail_view
+    scale = canvas.shape[1] / width, canvas.shape[0] / height
     every = max(1, round(float(np.sqrt((sheet.grid >= 0).sum())) / ACROSS))
     row, column = np.nonzero(sheet.grid >= 0)
     chosen = np.sort(sheet.grid[row, column][(row % every == 0) & (column % every == 0)])
     rows = slice(max(0, frame - TAIL), frame + 1)
-    paths = np.clip((sheet.tracks[rows, chosen] + 0.5) * scale - 0.5, -1e4, 1e4)
+    paths = np.clip((sheet.tracks[rows, chosen] - (left, top) + 0.5) * scale - 0.5, -1e4, 1e4)
     seen = sheet.visibility[rows, chosen]
     for number in np.flatnonzero(seen[-1]):
         colour = tuple(int(level) for level in colours[chosen[number]])

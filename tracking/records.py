@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.tracking.contact_sheet import Sheet, draw_contact_sheet
+from pliant.tracking.contact_sheet import Sheet, View, draw_contact_sheet
 
 Stage = Literal["read", "locate", "track"]
 
@@ -104,7 +104,10 @@ class TrackedFilm:
     """Texture coordinates in the template image, shape `(P, 2)`, in [0, 1]: u right, v down, (0, 0) its upper left corner."""
 
     thumbnails: NDArray[np.uint8]
-    """Some frames in colour, 320 pixels wide, shape `(N, h, w, 3)`."""
+    """Some frames in colour, shape `(N, h, w, 3)`: the part that all visible points occupy, enlarged or reduced to w = 320 pixels."""
+
+    thumbnail_view: View
+    """That part: first column and row, width and height in pixels of the film."""
 
     thumbnail_frames: NDArray[np.int64]
     """Indices of the thumbnails among the F frames, shape `(N,)`."""
@@ -154,6 +157,6 @@ class TrackedFilm:
         """Draw the tracks over some frames, as one small JPEG picture."""
         sheet = Sheet(
             self.thumbnails, self.thumbnail_frames, self.tracks, self.visibility, self.grid, self.template,
-            self.frame_times, self.image_size[0],
+            self.frame_times, self.thumbnail_view,
         )  # fmt: skip
         return draw_contact_sheet(sheet, quality=quality)

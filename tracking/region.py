@@ -19,6 +19,16 @@ from pliant.tracking.seeding import Seeds, neighbours, quads
 
 Region = NDArray[np.bool_] | NDArray[np.uint8] | Sequence[Sequence[float]] | Path | str
 
+DARK, LIGHT = 32, 223
+"""Levels of 0 to 255 up to which a pixel of a mask is black, and above which it is white: JPEG compression changes either by less."""
+
+LARGEST_OUTLINE = 0.02
+"""Share of a picture's pixels that may always be between black and white.
+
+More may be if they are at most twice as many as the white and as the black ones. Anti-aliased, JPEG-compressed and feathered outlines
+(standard deviation up to 2 % of the width, of discs 0.1 to 0.97 of the picture's height) keep to that; photographs and drawings do not.
+"""
+
 LONG_STEP = 2
 """Frames per step when a region is carried to the template; longer steps lose fast motion."""
 
@@ -27,12 +37,13 @@ def read_region(region: Region, size: tuple[int, int]) -> Bools:
     """Convert a region to a mask, shape `(H, W)`.
 
     The region is the path of a mask picture of the film's size, an array `(H, W)` (bool, or uint8 with 128 and above inside), or a polygon
-    of pixels `(N, 2)` with N ≥ 3. In pictures with transparency, opaque pixels are inside.
+    of pixels `(N, 2)` with N ≥ 3. In pictures with transparency, opaque pixels are inside. Pictures must be black and white, except for a
+    soft outline.
 
     Raises
     ------
     FilmError
-        Not a mask or polygon, another size than the film's, or empty.
+        Not a mask or polygon, not black and white, another size than the film's, or empty.
     """
     if isinstance(region, str | Path):
         mask = _from_picture(Path(region), size)
@@ -49,7 +60,7 @@ def read_region(region: Region, size: tuple[int, int]) -> Bools:
             f"{mask.shape[1]}×{mask.shape[0]}", "Draw the region on a frame of this film, upright as it is shown.",
         )  # fmt: skip
     if not mask.any():
-        raise _refusal("empty_region", "some pixels inside", "none", "Draw around the thing to track.")
+        raise _refusal("empty_region", "some pixels inside", "none", "Draw around the object to track.")
     return mask
 
 
@@ -112,8 +123,8 @@ def _from_picture(path: Path, size: tuple[int, int]) -> Bools:
             if picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info:
                 alpha = np.asarray(picture.convert("RGBA"))[..., 3]
                 if alpha.min() < 128:
-                    return np.asarray(alpha >= 128)
-            return np.asarray(np.asarray(picture.convert("L")) >= 128)
+                    return _from_levels(alpha)
+            return _from_levels(np.asarray(picture.convert("L")))
     except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise _refusal(
             "unreadable_region", "a PNG, JPEG, WebP, BMP or GIF picture", f"{path.name}: {error}",
@@ -130,6 +141,24 @@ def _from_array(given: NDArray[np.generic]) -> Bools:
     return np.asarray(given if given.dtype == bool else np.asarray(given, dtype=np.uint8) >= 128, dtype=bool)
 
 
+def _from_levels(levels: NDArray[np.uint8]) -> Bools:
+    """Return the pixels of a picture that are white.
+
+    Raises
+    ------
+    FilmError
+        The picture is not black and white.
+    """
+    black, white = float((levels <= DARK).mean()), float((levels > LIGHT).mean())
+    between = 1 - black - white
+    if between > max(LARGEST_OUTLINE, 2 * min(black, white)):
+        raise _refusal(
+            "wrong_region", "a black and white mask", f"a picture in which {between:.0%} of the pixels are in between",
+            "Paint the object white and everything else black.",
+        )  # fmt: skip
+    return np.asarray(levels >= 128)
+
+
 def _from_polygon(given: ArrayLike, size: tuple[int, int]) -> Bools:
     try:
         corners = np.asarray(given, dtype=np.float64)
@@ -138,7 +167,7 @@ def _from_polygon(given: ArrayLike, size: tuple[int, int]) -> Bools:
     if len(corners) < 3 or not np.isfinite(corners).all() or np.abs(corners).max() > 1e6:
         raise _refusal(
             "wrong_polygon", "a polygon of at least 3 corners with finite pixel coordinates",
-            f"{len(corners)} corners", "Draw around the thing to track.",
+            f"{len(corners)} corners", "Draw around the object to track.",
         )  # fmt: skip
     mask = np.zeros(size[::-1], dtype=np.uint8)
     cv2.fillPoly(mask, [np.round(corners).astype(np.int32)], 1)

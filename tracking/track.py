@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.threads import available_cores
-from pliant.tracking.advice import warnings_before, warnings_of
+from pliant.tracking.advice import warnings_before, warnings_of, warnings_unread
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.chaining import Chain, chain
+from pliant.tracking.contact_sheet import View, view_of
 from pliant.tracking.decoding.film import Film, open_film
 from pliant.tracking.decoding.limits import FilmLimits
 from pliant.tracking.errors import FilmError, TrackingStopped
@@ -50,6 +51,7 @@ class _Run:
     pool: ThreadPoolExecutor
     on_step: OnStep
     should_stop: Callable[[], bool]
+    on_warnings: Callable[[list[str]], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +76,7 @@ def track_film(
     limits: FilmLimits | None = None,
     threads: int | None = None,
     on_step: OnStep | None = None,
+    on_warnings: Callable[[list[str]], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> TrackedFilm:
     """Track a grid of points on a surface in a film.
@@ -102,6 +105,9 @@ def track_film(
         Threads for optical flow; by default one per available core, at most 4.
     on_step
         Called after every frame of every stage.
+    on_warnings
+        Called with the warnings so far, which are the first of the result's: before the film is read, and again before its points are
+        followed.
     should_stop
         Called at every frame of every stage; returning True stops the tracker.
 
@@ -117,8 +123,9 @@ def track_film(
     stop = should_stop or (lambda: False)
     workers = threads or min(4, available_cores())
     with opencv_serial(), FrameStore() as store, ThreadPoolExecutor(workers) as pool:
-        run = _Run(opened, store, pool, on_step or (lambda _: None), stop)
+        run = _Run(opened, store, pool, on_step or (lambda _: None), stop, on_warnings or (lambda _: None))
         mask = None if region is None else read_region(region, opened.size)
+        run.on_warnings(warnings_unread(whole=region is None))
         found = survey(opened, store, longest_side=longest_side, on_step=run.on_step, should_stop=stop)
         step = None if grid_step is None else grid_step * tracking_scale(opened.size, longest_side)
         plan = _plan(run, found, mask, region_frame, template_frame)
@@ -142,7 +149,7 @@ def _plan(run: _Run, found: Survey, mask: Bools | None, region_frame: int, templ
     if stop - start < 3:
         raise FilmError(
             "too_few_frames", field="film", expected="a shot of at least 3 frames", got=f"{stop - start} between two cuts",
-            hint="Film the thing in one take, or draw the region in a longer shot (region_frame).",
+            hint="Film the object in one take, or draw the region in a longer shot (region_frame).",
         )  # fmt: skip
     if template_frame is not None:
         template = min(max(_nearest(found, template_frame, "template_frame"), start), stop - 1)
@@ -188,6 +195,8 @@ def _track(run: _Run, found: Survey, plan: _Plan, step: float | None, *, whole: 
             got=f"{len(seeds.points)} (texture in {rough:.0%} of the region)",
             hint="Draw a larger region, use a smaller grid_step, or film a surface with a pattern, in focus and in good light.",
         )  # fmt: skip
+    notes = warnings_before(run.film, found, plan.start, plan.stop, whole=whole, rough=rough)
+    run.on_warnings(notes)
     appearance = Appearance.of(template, seeds.points, neighbours(seeds.grid, len(seeds.points)))
     registration = Registration.of(template, seeds.points, seeds.grid, noise=appearance.noise)
     length = plan.stop - plan.start
@@ -218,7 +227,6 @@ def _track(run: _Run, found: Survey, plan: _Plan, step: float | None, *, whole: 
             got=str(len(kept)),
             hint="Film more slowly and with more light, so that successive frames overlap and are not blurred.",
         )  # fmt: skip
-    notes = warnings_before(run.film, found, plan.start, plan.stop, whole=whole, rough=rough)
     return _assemble(run, found, plan, chained, kept_grid, kept, notes)
 
 
@@ -241,16 +249,17 @@ def _assemble(
     tracks = chained.points[:, : len(kept)]
     template = plan.template - plan.start
     picked = np.unique(np.linspace(0, len(indices) - 1, THUMBNAILS).round().astype(np.int64))
-    image, thumbnails = _pictures(run, indices, template, picked)
+    view = view_of(tracks, visible, run.film.size)
+    image, thumbnails = _pictures(run, indices, template, picked, view)
     span = float(times[-1] - times[0])
     info = FilmInfo(
         run.film.path.name, run.film.container, run.film.size, (len(times) - 1) / span if span > 0 else run.film.fps,
         indices, times, tuple(int(found.indices[row]) for row in found.cuts),
     )  # fmt: skip
     uv = ((tracks[template] + 0.5) / np.array([width, height])).astype(np.float32)
-    notes += warnings_of(tracks, visible, template)
+    warnings = (*notes, *warnings_of(tracks, visible, template))
     return TrackedFilm(
-        info, tracks, visible, confidence, grid, quads(grid), template, image, uv, thumbnails, picked, tuple(notes)
+        info, tracks, visible, confidence, grid, quads(grid), template, image, uv, thumbnails, view, picked, warnings
     )
 
 
@@ -260,18 +269,19 @@ def _in_film(points: Floats, scale: Floats) -> Floats:
 
 
 def _pictures(
-    run: _Run, indices: NDArray[np.int64], template: int, picked: NDArray[np.int64]
+    run: _Run, indices: NDArray[np.int64], template: int, picked: NDArray[np.int64], view: View
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Decode the film again for the template in colour and the thumbnails; the store holds grey frames only."""
     wanted = {int(indices[row]) for row in picked} | {int(indices[template])}
-    width, height = run.film.size
-    small = (THUMBNAIL_WIDTH, max(1, round(height * THUMBNAIL_WIDTH / width)))
+    left, top, width, height = view
+    small = (THUMBNAIL_WIDTH, max(1, round(run.film.size[1] * THUMBNAIL_WIDTH / run.film.size[0])))
     thumbnails, image = {}, np.zeros((0, 0, 3), np.uint8)
     for frame in run.film.frames():
         if run.should_stop():
             raise TrackingStopped
         if frame.index in wanted:
-            thumbnails[frame.index] = np.asarray(cv2.resize(frame.image, small, interpolation=cv2.INTER_AREA), np.uint8)
+            part = frame.image[top : top + height, left : left + width]
+            thumbnails[frame.index] = np.asarray(cv2.resize(part, small, interpolation=cv2.INTER_AREA), np.uint8)
         if frame.index == indices[template]:
             image = frame.image
         if frame.index >= max(wanted):

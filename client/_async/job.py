@@ -120,7 +120,7 @@ class AsyncRemoteJob:
         return await self._client.share(self.id, days=days, timeout=timeout)
 
     async def delete(self, *, timeout: float | None = None) -> None:
-        """Delete the job and its files."""
+        """Delete the job and its files from the service; `record` and `status` keep their last values."""
         await self._client.delete(self.id, timeout=timeout)
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 import secrets
 import tempfile
 from collections.abc import Generator, Iterable, Mapping, Sequence
@@ -237,18 +238,37 @@ class Client(Connection):
         return RemoteJob(self, self._exchange(timeout).record(Call(method="GET", path=job_path(job)), Job))
 
     def list(
-        self, *, statuses: Iterable[Status | str] = (), page_size: int = 50, timeout: float | None = None
+        self,
+        *,
+        statuses: Iterable[Status | str] = (),
+        limit: int | None = None,
+        page_size: int = 50,
+        timeout: float | None = None,
     ) -> Generator[RemoteJob, None, None]:
-        """Iterate over the jobs, newest first; pages are requested as needed."""
+        """Iterate over the jobs, newest first; pages are requested as needed.
+
+        Parameters
+        ----------
+        statuses : iterable of Status or str
+            Only jobs with one of these; by default all.
+        limit : int, optional
+            At most this many jobs; by default all.
+        page_size : int
+            Jobs per request, at most 200.
+        timeout : float, optional
+            Seconds for all requests together.
+        """
         exchange, wanted = self._exchange(timeout), [Status(status).value for status in statuses]
-        params: dict[str, str | Sequence[str]] = {"limit": str(page_size), "status": wanted}
+        left = math.inf if limit is None else limit
         cursor: str | None = ""
-        while cursor is not None:
+        while cursor is not None and left > 0:
+            params: dict[str, str | Sequence[str]] = {"limit": str(min(page_size, left)), "status": wanted}
+            if cursor:
+                params["cursor"] = cursor
             page = exchange.record(Call(method="GET", path="/v1/jobs", params=params), JobPage)
             for job in page.jobs:
                 yield RemoteJob(self, job)
-            cursor = page.next
-            params = {**params, "cursor": cursor or ""}
+            cursor, left = page.next, left - len(page.jobs)
 
     def wait(
         self,

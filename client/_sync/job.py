@@ -121,7 +121,7 @@ class RemoteJob:
         return self._client.share(self.id, days=days, timeout=timeout)
 
     def delete(self, *, timeout: float | None = None) -> None:
-        """Delete the job and its files."""
+        """Delete the job and its files from the service; `record` and `status` keep their last values."""
         self._client.delete(self.id, timeout=timeout)
 
 

@@ -124,7 +124,7 @@ def frame_errors(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -
     return align(shapes, truth, kind=kind).relative
 
 
-def point_errors(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -> Floats:
+def point_errors(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame_scaled") -> Floats:
     """Distance of every point from its true position, shape `(F, P)`, the truth's unit."""
     return align(shapes, truth, kind=kind).distances
 

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 from pliant.cli import app
 from pliant.cli.exits import Exit
+from pliant.client.errors import BadArgument
 from typer.testing import CliRunner, Result
 
 QUICK = ["-O", "outputs=[]", "-O", "max_reweightings=2", "-O", "grid_step=6", "-O", "refine_rotations=false"]
@@ -43,7 +44,9 @@ def test_a_film_is_solved_and_its_tracks_are_written_beside_the_shapes(film: Pat
     assert (options["fps"], options["image_size"]) == (30.0, "96x72")
     words = solve(film, "-o", tmp_path, "--force", "-O", "frames=:5", *QUICK).output
     assert "A film of 96×72 pixels, 5 of 10 frames, 30 frames per second." in words
-    assert "No region was given" in words
+    assert words.count("No region was given") == 1
+    assert words.count("Only 5 frames are tracked") == 1
+    assert words.index("No region was given") < words.index("metric")
 
 
 def test_invalid_films_and_parts_are_rejected_with_a_message(film: Path, tmp_path: Path) -> None:
@@ -80,6 +83,11 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
         "tracking about",
     ):
         assert each in words
+    assert facts["warnings"] == []
+    assert [each[:19] for each in everything["warnings"]] == ["No region was given"]
+    assert "warning No region was given" in words
+    assert "warning Only 5 frames are tracked." in words
+    assert "warning" not in inspect(film, "-O", "region_polygon=[[20,20],[70,20],[70,55]]").output
     refused = inspect(film, "--mesh", "3x4")
     assert refused.exit_code == Exit.REFUSED
     assert "--mesh: expected tracks, got a film" in refused.output
@@ -101,3 +109,16 @@ def copied(film: Path, folder: Path) -> Path:
     copy = folder / film.name
     copy.write_bytes(film.read_bytes())
     return copy
+
+
+def test_a_film_without_a_region_gets_its_warning_before_it_is_tracked(
+    film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*given: object, **options: object) -> None:
+        raise BadArgument("Stopped before the film is tracked.")
+
+    monkeypatch.setattr("pliant.worker.execution.film.reconstruct_film", stopped)
+    ran = solve(film, "-o", tmp_path)
+    assert "No region was given" in ran.stderr
+    assert "Stopped" in ran.stderr
+    assert "No region" not in solve(film, "-o", tmp_path, "--region", film.with_name("mask.png")).stderr

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from pliant.cli import app
+from pliant.tracking import FilmError
 from pliant.tracking.records import TrackingStep
 from typer.testing import CliRunner
 
@@ -35,6 +36,58 @@ def test_a_film_becomes_tracks_and_a_preview(tmp_path: Path) -> None:
     ran = CliRunner().invoke(app, ["track", *files, "--frames", ":4", "--force"])
     assert "points in 4 frames" in ran.stdout
     assert "Only 4 frames" in ran.stderr
+    assert "sheet" not in ran.stdout
+
+
+def test_the_preview_is_named_in_the_output(tmp_path: Path) -> None:
+    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72)))
+    files = [
+        "track",
+        str(film),
+        "-o",
+        str(tmp_path / "tracks.npz"),
+        "--preview",
+        str(tmp_path / "sheet.jpg"),
+        "--force",
+    ]
+    ran = CliRunner().invoke(app, files)
+    assert f"{tmp_path / 'sheet.jpg'}: the tracks over 4 of the frames." in ran.stdout
+    assert json.loads(CliRunner().invoke(app, [*files, "--json"]).stdout)["preview"] == str(tmp_path / "sheet.jpg")
+
+
+def test_warnings_are_printed_once_and_before_the_work_they_are_about(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The tracker's survey stops here, so that only what was known before the film was read has been printed."""
+    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72)))
+    files = ["track", str(film), "-o", str(tmp_path / "tracks.npz")]
+    ran = CliRunner().invoke(app, files)
+    sentences = ["No region was given, so everything in the picture is tracked", "Only 4 frames are tracked."]
+    for sentence in sentences:
+        assert ran.stderr.count(sentence) == 1
+    assert ran.stderr.index(sentences[0]) < ran.stderr.index(sentences[1])
+
+    def stopped(*given: object, **options: object) -> None:
+        raise FilmError("damaged_file", field="film", expected="a film", got="none", hint="Stop here.")
+
+    for stage, seen in (("survey", sentences[:1]), ("chain", sentences)):
+        with monkeypatch.context() as patch:
+            patch.setattr(importlib.import_module("pliant.tracking.track"), stage, stopped)
+            ran = CliRunner().invoke(app, [*files, "--force"])
+        assert ran.exit_code == 3
+        assert [sentence for sentence in sentences if sentence in ran.stderr] == seen
+
+
+def test_a_photograph_is_no_mask(tmp_path: Path) -> None:
+    pictures = films.textured_pictures(4, (96, 72))
+    film = films.write_film(tmp_path / "film.mkv", pictures)
+    Image.fromarray(pictures[0]).save(tmp_path / "photo.png")
+    ran = CliRunner().invoke(
+        app, ["track", str(film), "--region", str(tmp_path / "photo.png"), "-o", str(tmp_path / "tracks.npz"), "--json"]
+    )
+    document = json.loads(ran.stderr)
+    assert (ran.exit_code, document["code"], document["field"]) == (3, "wrong_region", "region")
+    assert document["explained_at"] == "pliant explain wrong_region"
 
 
 def test_a_file_of_tracks_is_no_film(tmp_path: Path) -> None:
@@ -89,7 +142,7 @@ def test_progress_lines_are_printed_without_a_terminal(
         "read 30 frames": TrackingStep(stage="read", done=30, total=None),
         "track 25%": TrackingStep(stage="track", done=5, total=20),
     }
-    with module._bars() as on_step:
+    with module._bars() as (on_step, _):
         for line, step in steps.items():
             if step is not None:
                 on_step(step)

@@ -13,7 +13,7 @@ from pliant.cli.demo import MEANINGS, report
 from pliant.cli.session import Session
 from pliant.cli.show import METRIC_MEANINGS, metrics_table, show_job, show_jobs, verdict_lines
 from pliant.cli.solve import show_finished
-from pliant.schemas.job import Interpretation, Job, Status
+from pliant.schemas.job import Interpretation, Job, Progress, Status
 from pliant.schemas.options import Options
 from pliant.worker.jobs.finished import Finished
 
@@ -53,6 +53,15 @@ def test_solve_ends_with_the_verdict(capsys: pytest.CaptureFixture[str]) -> None
     show_finished(finished(), Path("out"), as_json=True)
     printed = json.loads(capsys.readouterr().out)
     assert (printed["verdict"], printed["verdict_reasons"], printed["trust_sentence"]) == ("with_care", [REASON], TRUST)
+
+
+def test_a_verdict_without_an_error_estimate_says_so_first(capsys: pytest.CaptureFixture[str]) -> None:
+    sentence = "The error is not estimated; depth rests on 41° of turn."
+    (line,) = verdict_lines(finished(verdict="good", verdict_reasons=(), trust_sentence=sentence))
+    assert line.plain.startswith(f"Good, error not estimated  {sentence}")
+    assert not any("green" in str(span.style) for span in line.spans)
+    show_jobs([job(verdict="good", trust_sentence=sentence)], as_json=False)
+    assert "Good, error not estimated" in " ".join(capsys.readouterr().out.split())
 
 
 def test_solve_states_the_camera(capsys: pytest.CaptureFixture[str]) -> None:
@@ -97,7 +106,7 @@ def test_the_demo_explains_its_metrics(capsys: pytest.CaptureFixture[str], monke
 
 def test_headline_error_and_metric_meanings_match_the_web_page() -> None:
     headline = next(iter(METRIC_MEANINGS))
-    assert headline == next(iter(MEANINGS)) == "e3d_frame"
+    assert headline == next(iter(MEANINGS)) == "e3d_frame_scaled"
     assert MEANINGS[headline].startswith(METRIC_MEANINGS[headline])
     page = (Path(__file__).parents[2] / "service" / "web" / "src" / "results.ts").read_text()
     words = dict(re.findall(r'^  (\w+): \["(?:[^"]*)", "([^"]*)"\],$', page, flags=re.MULTILINE))
@@ -107,10 +116,29 @@ def test_headline_error_and_metric_meanings_match_the_web_page() -> None:
 
 
 def test_the_metrics_table_starts_with_the_headline_error() -> None:
-    table = metrics_table({"of_a_newer_service": 1.0, "reprojection_rms": 0.5, "e3d_sequence": 0.2, "e3d_frame": 0.1})
+    table = metrics_table(
+        {"of_a_newer_service": 1.0, "reprojection_rms": 0.5, "e3d_sequence": 0.2, "e3d_frame_scaled": 0.1}
+    )
     names, _, meanings = (list(column.cells) for column in table.columns)
-    assert names == ["e3d_frame", "e3d_sequence", "reprojection_rms", "of_a_newer_service"]
+    assert names == ["e3d_frame_scaled", "e3d_sequence", "reprojection_rms", "of_a_newer_service"]
     assert meanings == [*(METRIC_MEANINGS[name] for name in names[:3]), ""]
+
+
+def test_the_job_list_is_complete_at_80_columns(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    named = job(id="e2efed37cfcf5352891c", name="talking head", verdict="with_care")
+    progress = Progress(stage="reweight", fraction=0.5, updated_at=datetime.now(UTC))
+    running = named.model_copy(update={"status": Status.RUNNING, "verdict": None, "progress": progress})
+    show_jobs([named, running], as_json=False)
+    printed = capsys.readouterr().out
+    assert "…" not in printed
+    day = f"{named.created_at.astimezone():%Y-%m-%d %H:%M}"
+    assert re.search(rf"^{named.id} succeeded +{day} Use with ", printed, flags=re.MULTILINE), printed
+    assert re.search(rf"^{named.id} running 50% {day} ", printed, flags=re.MULTILINE), printed
+    assert all(word in printed.split() for word in ("care", "talking", "head"))
+    assert max(len(line) for line in printed.splitlines()) <= 80
 
 
 @pytest.mark.parametrize("columns", ["40", "80", "200"])

@@ -196,6 +196,9 @@ def test_a_job_can_have_an_id_chosen_by_the_client(client: Client) -> None:
 def test_jobs_are_listed_newest_first_over_pages_and_by_status(client: Client) -> None:
     ids = [client.submit(moving_points(), options=FAST, name=str(i)).id for i in range(5)]
     assert [job.id for job in client.list(page_size=2)][:5] == ids[::-1]
+    for page_size in (2, 50):
+        assert [job.id for job in client.list(limit=3, page_size=page_size)] == ids[:1:-1]
+    assert list(client.list(limit=0)) == []
     client.wait(ids[0], timeout=60)
     for id in ids[1:]:
         with suppress(NotAllowedNow):  # it may be done already
@@ -214,6 +217,7 @@ def test_a_finished_job_can_be_deleted_but_not_cancelled(client: Client) -> None
     assert job.refresh().status is Status.SUCCEEDED
     assert client.result(job.id).report["outcome"] in ("converged", "max_reweightings")
     job.delete()
+    assert job.status is Status.SUCCEEDED, "its last state"
     with pytest.raises(NotFound):
         client.get(job.id)
 

@@ -37,6 +37,14 @@ def test_every_example_script_is_tested() -> None:
     assert all(f'run("{script}"' in Path(__file__).read_text() for script in scripts)
 
 
+@pytest.mark.parametrize("script", sorted(path.name for path in EXAMPLES.glob("*.py")))
+def test_an_example_without_arguments_prints_its_usage(script: str) -> None:
+    ran = subprocess.run([sys.executable, EXAMPLES / script], capture_output=True, text=True, timeout=60, check=False)
+    assert ran.returncode == 1
+    assert f"python examples/{script} " in ran.stderr
+    assert "Traceback" not in ran.stderr
+
+
 def test_from_cotracker(run, tmp_path: Path) -> None:
     points = SEQUENCE.tracks.points[None].astype(np.float32)
     np.savez(tmp_path / "tracks.npz", pred_tracks=points, pred_visibility=np.ones(points.shape[:3], bool))

@@ -14,8 +14,9 @@ import httpx
 import numpy as np
 import pytest
 from browsing import why_not
-from paging import BOTH_WIDTHS_AND_THEMES, drop, until
-from playwright.sync_api import Page, Route, expect
+from paging import BOTH_WIDTHS_AND_THEMES, drop, packed, until
+from PIL import Image
+from playwright.sync_api import Browser, Page, Route, expect
 
 pytestmark = [
     pytest.mark.chromium,
@@ -54,12 +55,26 @@ def films(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
             writer.write(frame)
         writer.release()
         found[name] = (folder / name).read_bytes()
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+    listed = io.BytesIO()
+    with zipfile.ZipFile(listed, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("film/10.png", picture(BLUE))
         archive.writestr("film/9.png", picture(RED))
         archive.writestr("__MACOSX/film/._1.png", b"not a picture")
-    return {**found, "pictures.zip": packed.getvalue()}
+    return {**found, "pictures.zip": listed.getvalue(), **moving()}
+
+
+def moving() -> dict[str, bytes]:
+    """The same six frames as a zip of pictures and as an animation."""
+    pictures = [picture(RED if i == 0 else BLUE) for i in range(6)]
+    listed, animation = io.BytesIO(), io.BytesIO()
+    with zipfile.ZipFile(listed, "w") as archive:
+        for index, each in enumerate(pictures):
+            archive.writestr(f"{index}.png", each)
+    first, *others = (Image.open(io.BytesIO(each)) for each in pictures)
+    # Equal frames would be joined to one.
+    others = [Image.fromarray(np.asarray(each) // 8 * 8 + np.uint8(index)) for index, each in enumerate(others)]
+    first.save(animation, "GIF", save_all=True, append_images=others, duration=60)
+    return {"moving.zip": listed.getvalue(), "moving.gif": animation.getvalue()}
 
 
 @pytest.fixture
@@ -137,7 +152,8 @@ def test_a_dropped_film_shows_its_first_frame_and_hides_other_inputs(
     assert red > 150
     assert max(green, blue) < 90
     expect(filming.get_by_text("turn the object by 30° or more, and keep it sharp and large")).to_be_visible()
-    expect(filming.get_by_text("No region: the whole picture is tracked.")).to_be_visible()
+    advice = "No region: everything in the picture is tracked, the background included. Draw around the object."
+    expect(filming.get_by_text(advice)).to_be_visible()
     expect(filming.get_by_role("region", name="How your files are interpreted")).to_contain_text("6 frames")
     for part in ("tracks", "mesh", "ground_truth", "rotations"):
         expect(filming.locator(f"[data-part={part}]")).to_be_hidden()
@@ -187,8 +203,17 @@ def test_a_region_is_drawn_with_the_keyboard_only(
     expect(filming.get_by_role("application")).to_be_focused()
     status = filming.get_by_role("dialog").get_by_role("status")
     keys = filming.keyboard
+    use = filming.get_by_role("button", name="Use this region")
+    rectangle, lasso = (filming.get_by_role("button", name=name) for name in ("Rectangle", "Lasso"))
+    expect(use).to_be_disabled()
+    keys.press("Enter")  # there is no region yet
+    expect(use).to_be_visible()
+    expect(lasso).to_have_attribute("aria-pressed", "true")
     keys.press("ArrowRight")
     expect(status).to_have_text("Rectangle, 160 × 120 pixels at 80, 60.")
+    expect(rectangle).to_have_attribute("aria-pressed", "true")
+    expect(lasso).to_have_attribute("aria-pressed", "false")
+    expect(use).to_be_enabled()
     keys.press("ArrowRight")
     keys.press("ArrowUp")
     keys.press("Shift+ArrowDown")
@@ -208,6 +233,213 @@ def test_a_region_is_drawn_with_the_keyboard_only(
     filming.get_by_role("button", name="Reconstruct").press("Enter")
     expect(filming.get_by_text("Tracking the film")).to_be_visible()
     assert sent_options(filming)["region_polygon"] == [[0, 57], [160, 57], [160, 180], [0, 180]]
+
+
+def test_keys_work_after_a_click_on_a_button_of_the_dialog(filming: Page, films: dict[str, bytes]) -> None:
+    drop(filming, {"film.webm": films["film.webm"]})
+    filming.get_by_role("button", name="Draw a region").click()
+    status = filming.get_by_role("dialog").get_by_role("status")
+    for _ in range(3):
+        filming.keyboard.press("ArrowRight")
+    expect(status).to_contain_text("at 86, 60.")
+    undo = filming.get_by_role("button", name="Undo")
+    undo.click()
+    expect(status).to_contain_text("at 83, 60.")
+    filming.keyboard.press("Control+z")
+    expect(status).to_contain_text("at 80, 60.")
+    undo.click()  # nothing is left to undo, so the button that has the focus is disabled
+    expect(status).to_contain_text("No region")
+    filming.keyboard.press("ArrowRight")
+    expect(status).to_contain_text("at 80, 60.")
+    expect(filming.get_by_text("Keyboard: arrow keys move the region")).to_be_visible()
+    filming.keyboard.press("Escape")
+    expect(filming.get_by_role("dialog")).to_have_count(0)
+
+
+def test_touch_screens_show_no_keyboard_hint(browser: Browser, url: str, films: dict[str, bytes]) -> None:
+    context = browser.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
+    page = context.new_page()
+    page.goto(url)
+    page.get_by_text("Drop a film here").wait_for()
+    drop(page, {"film.webm": films["film.webm"]})
+    page.get_by_role("button", name="Draw a region").click()
+    expect(page.get_by_text("Keyboard: arrow keys move the region")).to_be_hidden()
+    context.close()
+
+
+def turn_to(page: Page, frame: int) -> None:
+    """Move the slider of the dialog to a frame with the keyboard, and wait until its picture is shown."""
+    slider = page.get_by_role("slider", name="Frame to draw on")
+    slider.press("Home")
+    for _ in range(frame):
+        slider.press("ArrowRight")
+    page.get_by_role("application", name=f"Frame {frame} of the film").wait_for()
+
+
+def inspected(page: Page, url: str, finished: str, **fields: Any) -> None:
+    """Let the service answer with these facts about the film."""
+    seen = {**film_record(url, finished)["interpretation"], "given_frames": 6, "sample": [], **fields}
+    page.route("**/v1/inspect", lambda route: route.fulfill(json=seen))
+
+
+@pytest.mark.parametrize("name", ["film.webm", "moving.zip", "moving.gif"])
+def test_a_region_is_drawn_on_another_frame(
+    filming: Page, url: str, films: dict[str, bytes], finished: str, name: str
+) -> None:
+    inspected(filming, url, finished)
+    answer_with(filming, film_record(url, finished))
+    drop(filming, {name: films[name]})
+    expect(filming.get_by_text("How your files are interpreted")).to_be_visible()
+    filming.get_by_role("button", name="Draw a region").click()
+    slider = filming.get_by_role("slider", name="Frame to draw on")
+    expect(slider).to_have_attribute("max", "5")
+    turn_to(filming, 3)
+    drawn = filming.get_by_role("application")
+    pixel = drawn.evaluate("(it) => [...it.getContext('2d').getImageData(4, 4, 1, 1).data]")
+    assert pixel[2] > 150 > pixel[0]  # only the first frame is red
+    drag(filming, (0.2, 0.2), (0.8, 0.2), (0.8, 0.8), (0.2, 0.8))
+    filming.get_by_role("button", name="Use this region").click()
+    expect(filming.get_by_text("Drawn on frame 3.")).to_be_visible()
+    shown = filming.get_by_role("img", name="Frame 3 of the film")
+    assert shown.evaluate("(it) => [...it.getContext('2d').getImageData(4, 4, 1, 1).data]")[2] > 60
+
+    filming.get_by_role("button", name="Change the region").click()
+    expect(slider).to_have_value("3")
+    turn_to(filming, 1)
+    filming.get_by_role("button", name="Cancel").click()
+    expect(filming.get_by_text("Drawn on frame 3.")).to_be_visible()
+    filming.get_by_role("button", name="Reconstruct").click()
+    expect(filming.get_by_text("Tracking the film")).to_be_visible()
+    assert sent_options(filming)["region_frame"] == 3
+    assert len(sent_options(filming)["region_polygon"]) > 3
+
+
+@pytest.mark.parametrize("frames", [None, 5, 8])
+def test_frames_without_certain_numbers_cannot_be_chosen(
+    filming: Page, url: str, films: dict[str, bytes], finished: str, frames: int | None
+) -> None:
+    """The film has 6 frames; with another number, evenly spaced frames have other times than the film's."""
+    inspected(filming, url, finished, given_frames=frames)
+    drop(filming, {"film.webm": films["film.webm"]})
+    expect(filming.get_by_text("How your files are interpreted")).to_be_visible()
+    filming.get_by_role("button", name="Draw a region").click()
+    filming.wait_for_timeout(1500)
+    expect(filming.get_by_role("slider", name="Frame to draw on")).to_be_hidden()
+    expect(filming.get_by_role("application", name="First frame of the film")).to_be_visible()
+
+
+def mask(*, inside: int = 255) -> bytes:
+    """A picture of the film's size, with the middle half marked."""
+    marked = np.full((HEIGHT, WIDTH), 255 - inside, np.uint8)
+    marked[HEIGHT // 4 : -HEIGHT // 4, WIDTH // 4 : -WIDTH // 4] = inside
+    return bytes(cv2.imencode(".png", marked)[1])
+
+
+@pytest.mark.parametrize("order", ["film first", "mask first", "together", "chosen"])
+def test_a_picture_beside_a_film_is_its_region(
+    filming: Page, url: str, films: dict[str, bytes], finished: str, order: str
+) -> None:
+    answer_with(filming, film_record(url, finished))
+    film, marked = {"film.webm": films["film.webm"]}, {"mask.png": mask()}
+    if order == "mask first":
+        drop(filming, marked)
+        expect(filming.locator("[data-part=mesh]")).to_contain_text("each pixel that is not black is a point")
+    drop(filming, {**marked, **film} if order == "together" else film)
+    if order == "film first":
+        drop(filming, marked)
+    if order == "chosen":
+        with filming.expect_file_chooser() as opened:
+            filming.get_by_role("button", name="Choose a mask picture").click()
+        opened.value.set_files({"name": "mask.png", "mimeType": "image/png", "buffer": mask()})
+    shown = filming.get_by_text("Region: the mask picture mask.png. What is white in it is tracked.")
+    expect(shown).to_be_visible()
+    until(lambda: colour_at_corner(filming)[0] < 140)  # darkened outside the mask
+    filming.get_by_role("button", name="Reconstruct").click()
+    expect(filming.get_by_text("Tracking the film")).to_be_visible()
+    assert dict(filming.evaluate("window.sent"))["region"] == "mask.png"
+    assert dict(filming.evaluate("window.sent"))["film"] == "film.webm"
+    assert "mesh" not in dict(filming.evaluate("window.sent"))
+    assert "region_polygon" not in sent_options(filming)
+    code = filming.get_by_role("region", name="Use from code")
+    expect(code).to_contain_text('film="film.webm"')
+    expect(code).to_contain_text('region="mask.png"')
+    expect(code).to_contain_text("# array (6, points, 3)")
+    filming.reload()
+    expect(code).to_contain_text('region="mask.png"')
+
+
+def test_the_code_of_a_job_quotes_the_names_of_its_files(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
+    answer_with(filming, film_record(url, finished))
+    drop(filming, {"my film; 2.webm": films["film.webm"]})
+    filming.get_by_role("button", name="Reconstruct").click()
+    code = filming.get_by_role("region", name="Use from code")
+    expect(code).to_contain_text('film="my film; 2.webm"')
+    for language, words in (
+        ("Shell", "pliant submit 'my film; 2.webm'"),
+        ("curl", "-F 'film=@\"my film; 2.webm\"'"),  # a semicolon ends the name for curl
+    ):
+        filming.get_by_role("button", name=language, exact=True).click()
+        expect(code).to_contain_text(words)
+
+
+def test_a_mask_and_a_drawn_region_exclude_each_other(filming: Page, films: dict[str, bytes]) -> None:
+    drop(filming, {"film.webm": films["film.webm"]})
+    filming.get_by_role("button", name="Draw a region").click()
+    filming.keyboard.press("ArrowRight")
+    filming.get_by_role("button", name="Use this region").click()
+    drop(filming, {"mask.png": mask()})
+    words = filming.locator(".filming").get_by_role("status")
+    expect(words).to_contain_text("the mask picture mask.png")
+    filming.get_by_role("button", name="Draw a region").click()
+    filming.keyboard.press("ArrowRight")
+    filming.get_by_role("button", name="Use this region").click()
+    expect(words).to_have_text("Rectangle, 160 × 120 pixels at 80, 60.")
+    drop(filming, {"mask.png": mask()})
+    filming.get_by_role("button", name="Remove the region").click()
+    expect(words).to_contain_text("No region")
+    expect(filming.get_by_role("button", name="Remove the region")).to_be_hidden()
+
+
+def test_a_mask_of_another_size_is_refused_beside_the_film(page: Page, url: str, films: dict[str, bytes]) -> None:
+    page.goto(url)
+    page.get_by_text("Drop a film here").wait_for()
+    drop(page, {"film.webm": films["film.webm"], "mask.png": bytes(cv2.imencode(".png", np.eye(50) * 255)[1])})
+    expect(page.locator("[data-part=film]").get_by_role("alert")).to_contain_text("320×240 pixels", timeout=60_000)
+
+
+@pytest.mark.parametrize("name", ["make.py", "mesh.obj"])
+def test_a_file_that_does_not_belong_to_a_film_is_left_out(filming: Page, films: dict[str, bytes], name: str) -> None:
+    drop(filming, {"film.webm": films["film.webm"]})
+    filming.get_by_role("button", name="Draw a region").click()
+    filming.keyboard.press("ArrowRight")
+    filming.get_by_role("button", name="Use this region").click()
+    drop(filming, {name: b"print()"})
+    expect(filming.get_by_text(f"Left out: {name}. Only a mask picture can be added to a film.")).to_be_visible()
+    film = {"name": name, "mimeType": "", "buffer": b"print()"}
+    filming.get_by_label("Film", exact=True).set_input_files(film)  # type: ignore[arg-type]
+    expect(filming.locator("[data-part=film]")).to_contain_text("film.webm")
+    expect(filming.locator(".filming").get_by_role("status")).to_have_text("Rectangle, 160 × 120 pixels at 80, 60.")
+    drop(filming, {"tracks.npz": packed(tracks=np.zeros((3, 4, 2)))})  # tracks replace the film
+    expect(filming.get_by_text("Left out")).to_be_hidden()
+    expect(filming.locator("[data-part=tracks]")).to_contain_text("tracks.npz")
+    drop(filming, {"make.py": b"print()"})
+    expect(filming.get_by_text("Left out: make.py. This page does not know files of this kind.")).to_be_visible()
+    expect(filming.locator("[data-part=tracks]")).to_contain_text("tracks.npz")
+
+
+def test_a_film_job_is_run_again_with_its_region(filming: Page, url: str, finished: str) -> None:
+    corners = [[10, 10], [90, 10], [90, 90]]
+    record = film_record(url, finished, status="succeeded", artifacts=[], sentence="Converged.")
+    record["options"] |= {"region_polygon": corners, "region_frame": 4}
+    answer_with(filming, record)
+    filming.goto(f"{url}/#job={finished}")
+    filming.get_by_role("button", name="Run again with other options").click()
+    filming.get_by_role("button", name="Reconstruct").click()
+    until(lambda: filming.evaluate("window.sent !== undefined"))
+    assert sent_options(filming)["region_polygon"] == corners
+    assert sent_options(filming)["region_frame"] == 4
 
 
 def test_a_region_can_be_drawn_by_touch(filming: Page, films: dict[str, bytes]) -> None:
@@ -379,12 +611,12 @@ def test_the_result_of_a_film_shows_its_contact_sheet(filming: Page, url: str, f
         assert address.startswith("data:" if token else "v1/jobs/")
     files = filming.get_by_role("region", name="Files").get_by_role("link")
     assert files.all_inner_texts() == ["contact_sheet.jpg", "tracks.npz"]
-    expect(filming.get_by_role("region", name="Use from code")).to_contain_text('film="film.mp4"')
+    expect(filming.get_by_role("region", name="Use from code")).to_contain_text('film="film.mp4"')  # sent elsewhere
 
 
 @pytest.mark.parametrize(("width", "scheme"), BOTH_WIDTHS_AND_THEMES)
 def test_form_and_dialog_have_no_accessibility_finding(
-    filming: Page, films: dict[str, bytes], scheme: str, width: int
+    filming: Page, url: str, films: dict[str, bytes], finished: str, scheme: str, width: int
 ) -> None:
     if not AXE.is_file() and not os.environ.get("CI"):
         pytest.skip("axe-core is not installed; say `make page`")
@@ -399,8 +631,11 @@ def test_form_and_dialog_have_no_accessibility_finding(
         if folder := os.environ.get("PLIANT_SCREENSHOTS"):
             filming.screenshot(path=f"{folder}/{name}-{width}-{scheme}.png")
 
+    inspected(filming, url, finished)
     drop(filming, {"film.webm": films["film.webm"]})
+    expect(filming.get_by_text("How your files are interpreted")).to_be_visible()
     filming.get_by_role("button", name="Draw a region").click()
+    turn_to(filming, 3)
     drag(filming, (0.3, 0.3), (0.5, 0.15), (0.7, 0.3), (0.75, 0.6), (0.5, 0.85), (0.25, 0.6))
     check("region")
     filming.get_by_role("button", name="Use this region").click()

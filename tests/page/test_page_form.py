@@ -90,6 +90,40 @@ def test_the_form_shows_input_errors_inline_and_keeps_the_button_visible(page: P
 
 
 @pytest.mark.usefixtures("front")
+def test_option_help_uses_the_words_of_the_form(page: Page) -> None:
+    """For every choice of every option; names and values of the API are no words."""
+    page.get_by_text("Files to write", exact=True).wait_for()
+    for summary in page.locator(".folds summary").all():
+        summary.click()
+    shown = page.evaluate(
+        """() => [...document.querySelectorAll('.folds .option')].flatMap((option) => {
+          const hint = () => option.querySelector('.hint').textContent;
+          const select = option.querySelector('select');
+          const choices = select === null ? [null] : [...select.options].map((choice) => choice.value);
+          return choices.map((choice) => {
+            if (choice !== null) {
+              select.value = choice;
+              select.dispatchEvent(new Event('change', { bubbles: true }));
+            }
+            return [option.querySelector('[title]').title, choice && select.selectedOptions[0].textContent, hint()];
+          });
+        })"""
+    )
+    assert len(shown) > 60
+    leaks = [each for each in shown if re.search(r"\w_\w|\bnull\b|\bauto\b|\w: auto", f"{each[1]} {each[2]}")]
+    assert leaks == []
+    help_of = {(name, choice): hint for name, choice, hint in shown}
+    assert help_of["camera", "automatic"].endswith("else no perspective.")
+    assert help_of["camera", "no perspective, one scale"] == "No scales."
+    assert help_of["layout", "frames, points"] == ""
+    assert help_of["coordinate_order", "automatic"].startswith("X before y")
+    assert "picture size" in help_of["field_of_view", None]
+    headings = page.locator(".folds summary, .zone .choose").all_inner_texts()
+    assert len({heading.strip().rstrip("s") for heading in headings}) == len(headings)
+    expect(page.locator("[data-part=film]")).to_contain_text("mkv")
+
+
+@pytest.mark.usefixtures("front")
 def test_a_film_chosen_as_tracks_moves_to_the_film_input(page: Page) -> None:
     page.locator("[data-part=film]").wait_for()
     film = {"name": "clip.mp4", "mimeType": "video/mp4", "buffer": b"\0\0\0\x18ftypmp42" + bytes(64)}
@@ -161,7 +195,7 @@ def test_a_finished_job_can_be_exported_shared_and_rerun(page: Page, url: str, f
 @pytest.mark.usefixtures("front")
 def test_invalid_options_and_missing_jobs_show_their_errors(page: Page, url: str, small: dict[str, bytes]) -> None:
     choose(page, {TRACKS: small[TRACKS]})
-    page.get_by_text("Camera", exact=True).click()
+    page.get_by_text("Lens", exact=True).click()
     page.get_by_label("Picture size").fill("wide")
     page.get_by_role("button", name="Reconstruct").click()
     place = page.locator(".option").filter(has=page.get_by_label("Picture size"))

@@ -61,6 +61,25 @@ def test_an_example_is_run_with_the_keyboard_only(page: Page, url: str) -> None:
     assert differing_pixels(before, canvas.screenshot()) > 0.01
 
 
+def test_the_focus_ring_of_a_jobs_heading_covers_nothing(page: Page, url: str, finished: str) -> None:
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.goto(url)
+    page.get_by_role("heading", name="Jobs").wait_for()
+    page.keyboard.press("Tab")
+    page.evaluate("(id) => (location.hash = `job=${id}`)", finished)
+    heading = page.get_by_role("heading", name="a finished face")
+    expect(heading).to_be_focused()
+    expect(page.locator(".detail-head .status")).to_have_text("Done")
+    ring, chip = page.evaluate("""() => {
+      const [heading, chip] = ['.detail-head h2', '.detail-head .status'].map((it) => document.querySelector(it));
+      const { outlineOffset, outlineWidth } = getComputedStyle(heading);
+      const ring = heading.getBoundingClientRect().bottom + parseFloat(outlineOffset) + parseFloat(outlineWidth);
+      return [ring, chip.getBoundingClientRect().top];
+    }""")
+    assert heading.evaluate("(it) => it.matches(':focus-visible')")
+    assert ring <= chip
+
+
 def test_no_request_leaves_the_host(page: Page, url: str, finished: str) -> None:
     asked: list[str] = []
 

@@ -44,8 +44,8 @@ def viewed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     inputs, solution, options = make_result(rows=21, columns=31, texture=True, outputs="glb,usd")
     inputs = replace(inputs, point_names=POINT_NAMES)
     report = build_report(inputs, solution, options, metrics={}, name="Take 3/Büro")
-    greys = [small_jpeg(np.full((240, 320, 3), level, np.uint8), longest_side=320, quality=90) for level in GREYS]
-    (folder / "film_frames.bin").write_bytes(packed(greys, (320, 240)))
+    greys = [small_jpeg(np.full((180, 320, 3), level, np.uint8), longest_side=320, quality=90) for level in GREYS]
+    (folder / "film_frames.bin").write_bytes(packed(greys, (320, 180)))
     report["artifacts"] = {"film_frames.bin": {}}
     write_artifacts(inputs, solution, options, report, folder, name="Take 3/Büro")
     command = [sys.executable, "-m", "pliant.cli", "view", str(folder), "--no-browser", "--json"]
@@ -114,12 +114,23 @@ def test_the_film_plays_in_step_beside_the_mesh(browser: Browser, viewed: str) -
     expect(following).not_to_be_checked()
     corner = """(it) => {
       const [across, down] = [it.width / 2, it.height / 2];
-      const shown = Math.min(it.width / 320, it.height / 240);
-      return it.getContext('2d').getImageData(Math.round(across + 150 * shown), Math.round(down + 110 * shown), 1, 1).data[0];
+      const shown = Math.min(it.width / 320, it.height / 180);
+      return it.getContext('2d').getImageData(Math.round(across + 150 * shown), Math.round(down + 80 * shown), 1, 1).data[0];
     }"""
     for frame in (1, 5):
         seek(page, frame)
         until(lambda frame=frame: abs(film.evaluate(corner) - GREYS[frame]) < 8)  # type: ignore[misc]
+    boxes = "() => [...document.querySelectorAll('.panes > .view')].map((it) => it.getBoundingClientRect().toJSON())"
+    # At 1000, the stage is as wide as beside the list of jobs at 1280.
+    for width, is_stacked in ((1600, False), (1000, True), (390, True)):
+        page.set_viewport_size({"width": width, "height": 900})
+        of_film, of_mesh = page.evaluate(boxes)
+        assert (of_film["bottom"] <= of_mesh["top"]) == is_stacked
+        if is_stacked:
+            assert of_film["width"] > 0.95 * page.locator(".panes").evaluate("(it) => it.clientWidth")
+            assert of_film["height"] < of_film["width"]
+        else:
+            assert of_film["height"] == pytest.approx(max(320, of_film["width"] * 180 / 320), rel=0.05)
     if AXE.is_file() or os.environ.get("CI"):
         for width in (1280, 390):
             page.set_viewport_size({"width": width, "height": 844})

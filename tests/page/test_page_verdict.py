@@ -12,6 +12,7 @@ import pytest
 from browsing import why_not
 from paging import DONE
 from playwright.sync_api import Page, Route, expect
+from pliant.solver.evaluation.trust import Trust
 
 pytestmark = [
     pytest.mark.chromium,
@@ -76,6 +77,36 @@ def test_the_verdict_is_above_the_viewer_and_in_the_list(
     assert above is not None
     assert below is not None
     assert above["y"] + above["height"] <= below["y"]
+
+
+def test_a_good_verdict_without_an_error_estimate_does_not_read_like_a_plain_one(
+    page: Page, url: str, finished: str
+) -> None:
+    sentence = Trust("good", (), None, None, turn_degrees=63, residual=0.001, hidden=0.1).sentence
+    judge(page, url, finished, verdict="good", verdict_reasons=[], trust_sentence=sentence, sentence="Converged.")
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.goto(f"{url}/#job={finished}")
+    badge = page.get_by_role("region", name="Verdict").locator(".badge")
+    expect(badge).to_have_text("Good, error not estimated")
+    expect(page.get_by_role("region", name="Verdict")).to_contain_text("depth rests on 63° of turn.")
+    page.get_by_role("heading", name="Jobs").click()
+    expect(page.locator(f'a[href="#job={finished}"]')).to_contain_text("Good, error not estimated")
+    colour = "(it) => getComputedStyle(it).backgroundColor"
+    unestimated = badge.evaluate(colour)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    if AXE.is_file() or os.environ.get("CI"):
+        page.evaluate(AXE.read_text())
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme, reduced_motion="reduce")  # type: ignore[arg-type]
+            found = page.evaluate("axe.run({include: ['.verdict', '.jobs']}).then((found) => found.violations)")
+            assert [(one["id"], [node["html"] for node in one["nodes"]]) for one in found] == [], scheme
+    page.emulate_media(color_scheme="light", reduced_motion="reduce")
+    page.goto("about:blank")
+    page.unroute_all()
+    judge(page, url, finished, verdict="good", verdict_reasons=[], trust_sentence=TRUST)
+    page.goto(f"{url}/#job={finished}")
+    expect(badge).to_have_text("Good")
+    assert badge.evaluate(colour) != unestimated
 
 
 def test_a_job_without_a_verdict_shows_none(page: Page, url: str, finished: str) -> None:

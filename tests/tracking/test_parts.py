@@ -10,7 +10,8 @@ import cv2
 import films
 import numpy as np
 import pytest
-from PIL import Image
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFilter
 from pliant.solver.evaluation.metrics import e3d_frame, e3d_frame_scaled
 from pliant.solver.gallery import sphere
 from pliant.tracking import FilmError
@@ -52,6 +53,53 @@ def test_regions_are_read_from_masks_polygons_and_files(tmp_path: Path) -> None:
     clear = np.dstack([np.zeros((48, 64, 3), np.uint8), mask.astype(np.uint8) * 255])
     Image.fromarray(clear).save(tmp_path / "clear.png")
     np.testing.assert_array_equal(read_region(str(tmp_path / "clear.png"), (64, 48)), mask)
+
+
+def disc(share: float, *, blur: float = 0.0) -> Image.Image:
+    """Return an anti-aliased white disc on black, `share` of the picture's height across, blurred by a share of its width."""
+    width, height = 320, 240
+    picture = Image.new("L", (4 * width, 4 * height))
+    x, y, radius = 2 * width, 2 * height, 2 * height * share
+    ImageDraw.Draw(picture).ellipse([x - radius, y - radius, x + radius, y + radius], fill=255)
+    return picture.resize((width, height), Image.Resampling.LANCZOS).filter(ImageFilter.GaussianBlur(blur * width))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.8, 0.97, 1.6])
+@pytest.mark.parametrize("name", ["mask.png", "mask.jpg"])
+def test_soft_and_compressed_outlines_are_masks(tmp_path: Path, name: str, share: float) -> None:
+    for blur in (0, 0.005, 0.02):
+        disc(share, blur=blur).save(tmp_path / name, quality=30)
+        inside = np.asarray(disc(share, blur=blur)) >= 128
+        assert (read_region(tmp_path / name, (320, 240)) != inside).mean() < 0.01
+
+
+def cut_out() -> NDArray[np.uint8]:
+    """Return a photograph that is black outside a disc."""
+    return np.where(np.asarray(disc(0.5)) >= 128, photograph(), 0).astype(np.uint8)
+
+
+def photograph() -> NDArray[np.uint8]:
+    return np.asarray(cv2.resize(films.textured_pictures(1, (80, 60))[0], (320, 240)))[..., 0]
+
+
+@pytest.mark.parametrize(
+    ("picture", "got"),
+    [
+        (photograph(), "a picture in which 90% of the pixels are in between"),
+        (cut_out(), "a picture in which 13% of the pixels are in between"),
+        (np.asarray(disc(0.5)) // 2, "a picture in which 15% of the pixels are in between"),
+    ],
+    ids=["photograph", "cut-out", "grey"],
+)
+def test_pictures_that_are_not_black_and_white_are_no_masks(
+    tmp_path: Path, picture: NDArray[np.uint8], got: str
+) -> None:
+    Image.fromarray(picture).save(tmp_path / "mask.png")
+    with pytest.raises(FilmError) as caught:
+        read_region(tmp_path / "mask.png", (320, 240))
+    assert caught.value.code == "wrong_region"
+    hint = "Paint the object white and everything else black."
+    assert str(caught.value) == f"region: expected a black and white mask, got {got}. {hint}"
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from pliant.solver.gallery import face, flag, sphere
 from pliant.tracking import FilmError, TrackedFilm, TrackingStep, TrackingStopped, track_film
+from pliant.tracking.contact_sheet import view_of
 from pliant.tracking.rendering import RenderedFilm
 
 FRAMES = 16
@@ -97,12 +98,45 @@ def test_the_contact_sheet_shows_film_and_tracks(turning: tuple[Path, RenderedFi
     assert len(sheet) < 200_000
     picture = cv2.imdecode(np.frombuffer(sheet, np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape == (2 * 240, 3 * 320, 3)
-    bare = cv2.resize(film.frame(0), (320, 240), interpolation=cv2.INTER_AREA)[..., ::-1]
+    left, top, width, height = tracked.thumbnail_view
+    assert width / height == pytest.approx(96 / 72, abs=0.05)
+    part = np.s_[top : top + height, left : left + width]
+    bare = cv2.resize(film.frame(0)[part], (320, 240), interpolation=cv2.INTER_AREA)[..., ::-1]
     drawn = np.abs(picture[:240, :320].astype(int) - bare).max(axis=2) > 80
-    outside = ~cv2.resize(film.region(0).astype(np.uint8), (320, 240)).astype(bool)
+    outside = ~cv2.resize(film.region(0)[part].astype(np.uint8), (320, 240)).astype(bool)
     outside[215:, :80] = False  # the time
     assert drawn[~outside].mean() > 0.03
     assert drawn[outside].mean() < 0.02
+
+
+def test_the_contact_sheet_shows_a_small_object_large(tmp_path: Path) -> None:
+    path = films.write_film(tmp_path / "film.mkv", films.textured_pictures(6, (320, 240)))
+    tracked = track_film(path, region=[(200, 60), (240, 60), (240, 90), (200, 90)])
+    left, top, width, height = tracked.thumbnail_view
+    assert (width / 40, height / 30) == pytest.approx((1.4, 1.4), abs=0.15)
+    seen = tracked.tracks[tracked.visibility]
+    assert (seen.min(axis=0) > (left, top)).all()
+    assert (seen.max(axis=0) < (left + width - 1, top + height - 1)).all()
+    assert tracked.thumbnails.shape[1:] == (240, 320, 3)
+
+
+@pytest.mark.parametrize(
+    ("corners", "view"),
+    [
+        ([(0, 0), (99, 49)], (0, 0, 100, 50)),
+        ([(0, 0), (9, 9)], (0, 0, 26, 13)),
+        ([(90, 40), (99, 49)], (74, 37, 26, 13)),
+        ([(45, 10), (54, 39)], (11, 6, 78, 39)),
+        ([(50, 25), (50, 25)], (49, 25, 3, 1)),
+    ],
+    ids=["the whole picture", "a corner", "the other corner", "a tall object", "a point"],
+)
+def test_the_view_of_points_lies_in_the_picture(
+    corners: list[tuple[int, int]], view: tuple[int, int, int, int]
+) -> None:
+    tracks = np.array([corners, [(-500, -500), corners[0]]], np.float32)  # a point that is not visible
+    visible = np.array([[True, True], [False, True]])
+    assert view_of(tracks, visible, (100, 50)) == view
 
 
 def test_the_result_does_not_depend_on_threads(turning: tuple[Path, RenderedFilm], tracked: TrackedFilm) -> None:
@@ -171,8 +205,8 @@ def test_without_a_region_the_whole_picture_is_tracked_with_a_warning(tmp_path: 
     assert 8 // 3 <= tracked.template < 8 - 8 // 3
     assert np.ptp(tracked.tracks[tracked.template], axis=0).min() > 50
     assert tracked.warnings[:2] == (
-        "No region was given, so everything in the picture is tracked, background included. Draw around the thing.",
-        "Only 8 frames are tracked. Film two seconds or more, while the thing turns.",
+        "No region was given, so everything in the picture is tracked, background included. Draw around the object.",
+        "Only 8 frames are tracked. Film two seconds or more, while the object turns.",
     )
 
 
@@ -193,7 +227,7 @@ def test_only_the_templates_shot_is_tracked(tmp_path: Path) -> None:
     tracked = track_film(path, region=polygon, region_frame=14)
     assert tracked.film.cuts == (10,)
     np.testing.assert_array_equal(tracked.film.frame_indices, np.arange(10, 20))
-    expected = "The film has a cut (at frame 10). Only frames 10 to 19 are tracked. Film the thing in one take."
+    expected = "The film has a cut (at frame 10). Only frames 10 to 19 are tracked. Film the object in one take."
     assert tracked.warnings == (expected,)
     assert tracked.visibility.mean() > 0.9
 
@@ -202,7 +236,7 @@ def test_a_still_film_gets_a_warning(tmp_path: Path) -> None:
     path = films.write_film(tmp_path / "film.mkv", films.textured_pictures(1, (96, 72)) * 12)
     tracked = track_film(path, region=[(20, 20), (70, 20), (70, 55), (20, 55)])
     assert tracked.warnings == (
-        "Nothing moves in this film, so it holds no information about depth. Turn the thing by 30° or more to both sides, "
+        "Nothing moves in this film, so it holds no information about depth. Turn the object by 30° or more to both sides, "
         "or walk around it.",
     )
 
@@ -211,7 +245,7 @@ def test_a_film_of_three_frames_is_tracked_and_one_of_two_refused(tmp_path: Path
     pictures = films.textured_pictures(3, (96, 72))
     tracked = track_film(films.write_film(tmp_path / "three.mkv", pictures))
     assert tracked.tracks.shape[0] == 3
-    assert "Only 3 frames are tracked. Film two seconds or more, while the thing turns." in tracked.warnings
+    assert "Only 3 frames are tracked. Film two seconds or more, while the object turns." in tracked.warnings
     with pytest.raises(FilmError, match="at least 3 frames, got 2") as caught:
         track_film(films.write_film(tmp_path / "two.mkv", pictures[:2]))
     assert caught.value.code == "too_few_frames"
@@ -326,7 +360,7 @@ def test_a_portrait_film_is_tracked_upright(tmp_path: Path) -> None:
     path = films.turned_by_90(films.write_film(tmp_path / "film.mp4", films.textured_pictures(6, (96, 72))))
     tracked = track_film(path, region=[(18, 20), (54, 20), (54, 76), (18, 76)])
     assert (tracked.image_size, tracked.template_image.shape) == ((72, 96), (96, 72, 3))
-    assert tracked.warnings == ("Only 6 frames are tracked. Film two seconds or more, while the thing turns.",)
+    assert tracked.warnings == ("Only 6 frames are tracked. Film two seconds or more, while the object turns.",)
     step = np.diff(tracked.tracks, axis=0)[tracked.visibility[1:] & tracked.visibility[:-1]]
     np.testing.assert_allclose(np.abs(np.median(step, axis=0)), [0, 1], atol=0.2)  # to the right as recorded
 
@@ -338,7 +372,7 @@ def test_a_4k_film_is_reduced_for_tracking(tmp_path: Path) -> None:
     path = films.write_film(tmp_path / "film.mp4", pictures)
     tracked = track_film(path, region=[(800, 500), (3000, 500), (3000, 1700), (800, 1700)])
     assert tracked.image_size == (3840, 2160)
-    assert tracked.warnings == ("Only 3 frames are tracked. Film two seconds or more, while the thing turns.",)
+    assert tracked.warnings == ("Only 3 frames are tracked. Film two seconds or more, while the object turns.",)
     step = np.diff(tracked.tracks, axis=0)[tracked.visibility[1:] & tracked.visibility[:-1]]
     np.testing.assert_allclose(np.median(step, axis=0), [20, 0], atol=1)
     assert 1000 < tracked.tracks.shape[1] < 6000

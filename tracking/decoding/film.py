@@ -85,7 +85,9 @@ class Film:
     def too_few_frames(self, count: int) -> FilmError:
         """Return (not raise) the error for fewer than `LEAST_FRAMES` selected frames; it states how pictures were read."""
         kind = OF_PICTURES.get(self.container)
-        hint = "Film two seconds or more, while the thing turns" if kind is None else "Add the other frames of the film"
+        hint = (
+            "Film two seconds or more, while the object turns" if kind is None else "Add the other frames of the film"
+        )
         if self.selection != (0, None, 1):
             hint += ", or widen the selection"
         if self.container == "folder":

@@ -15,9 +15,9 @@ faces      uint32 (T, 3)       triangles; quads are split
 cameras    float32 (F, 10)     rotation row by row, camera from world; then the scale
 positions  int16 (F, P, 3)     world = origin + step · value
 residuals  int16 (F, P, 2)     track − projection = residual_step · value; both −32768 where hidden
-truth      int16 (F, P, 3)     as positions, aligned with the result as for `e3d_frame`; only with ground truth
-frames     float32 (F, 6)      translation x, y; hidden share; expected error and `e3d_frame` as shares of the object's
-                               size; median residual. NaN where unknown
+truth      int16 (F, P, 3)     as positions, aligned with the result as for `e3d_frame_scaled`; only with ground truth
+frames     float32 (F, 6)      translation x, y; hidden share; expected error and `e3d_frame_scaled` as shares of the
+                               object's size; median residual. NaN where unknown
 points     uint32 (P, 2)       number of frames, of all, that show each point, and number in which it was rejected
 spread     uint16 (F, P)       standard deviation of a position = spread_step · value. Only with a posterior
 rejected   uint8 (F, ⌈P/8⌉)    bits, the lowest first: seen observations that the solver rejected as outliers
@@ -216,7 +216,7 @@ def _frames_table(tracks: Tracks, solution: Solution, truth: Floats | None) -> F
     if solution.shapes_std is not None:
         table[:, 3] = np.sqrt(np.square(solution.shapes_std).mean(axis=1)) / size_of(solution.shapes)
     if truth is not None and (known := np.isfinite(truth).all(axis=(0, 2))).sum() >= LEAST_TRUE:
-        table[:, 4] = frame_errors(solution.shapes[:, known], truth[:, known], kind="frame")
+        table[:, 4] = frame_errors(solution.shapes[:, known], truth[:, known], kind="frame_scaled")
     for frame in range(count):
         lengths = np.linalg.norm(_residual(tracks, solution, frame)[tracks.visible[frame] > 0], axis=1)
         if len(lengths):
@@ -238,10 +238,11 @@ def _onto(shapes: Floats, truth: Floats) -> tuple[Floats | None, bool]:
     known = np.isfinite(truth).all(axis=(0, 2))
     if known.sum() < LEAST_TRUE:
         return None, False
-    aligned = align(shapes[:, known], truth[:, known], kind="frame")
+    aligned = align(shapes[:, known], truth[:, known], kind="frame_scaled")
     turned = shapes.copy()
-    # aligned.shapes = (S − centre) Tᵀ ≈ G, so G T + centre ≈ S.
-    turned[:, known] = aligned.truth @ aligned.transforms + shapes[:, known].mean(axis=1, keepdims=True)
+    # aligned.shapes = k (S − centre) Tᵀ ≈ G, so G T / k + centre ≈ S.
+    centre, scale = shapes[:, known].mean(axis=1, keepdims=True), aligned.scales.mean()
+    turned[:, known] = aligned.truth @ aligned.transforms / scale + centre
     return turned, bool(np.linalg.det(aligned.transforms[0]) < 0)
 
 

@@ -44,7 +44,7 @@ class Result:
 
     @cached_property
     def distances(self) -> Floats | None:
-        """Distance of every point from the truth, `(F, P)`, as `e3d_frame` aligns the two; None without truth."""
+        """Distance of every point from the truth, `(F, P)`, as `e3d_frame_scaled` aligns the two, the truth's unit; None without truth."""
         truth = self.inputs.ground_truth
         return None if truth is None else point_errors(self.solution.shapes, truth.shapes)
 

@@ -31,7 +31,8 @@ def write_frames_csv(result: Result, file: IO[bytes]) -> None:
     if truth is not None and result.distances is not None:
         shapes = result.solution.shapes
         columns["e3d_sequence"] = frame_errors(shapes, truth.shapes, kind="sequence")
-        columns["e3d_frame"] = np.linalg.norm(result.distances, axis=1) / frobenius(centred(truth.shapes))
+        columns["e3d_frame"] = frame_errors(shapes, truth.shapes, kind="frame")
+        columns["e3d_frame_scaled"] = np.linalg.norm(result.distances, axis=1) / frobenius(centred(truth.shapes))
         columns["e3d_frame_similarity"] = frame_errors(shapes, truth.shapes, kind="frame_similarity")
         columns["distance_mean"] = result.distances.mean(axis=1)
         columns["distance_max"] = result.distances.max(axis=1)

@@ -2,9 +2,9 @@
 
 import { type Example, Refusal, exampleFile, getOptions, listExamples, newKey, submit } from "./api";
 import { button, h } from "./dom";
-import { rememberFilm } from "./live";
-import { OptionsForm, nameOf } from "./options";
+import { OptionsForm, drawn, nameOf } from "./options";
 import { refusalBox } from "./refusal";
+import { remember, rememberSame } from "./sent";
 import { PLACES, Slots } from "./slots";
 import { type Job, PARTS, type Part } from "./types";
 import { Inspection } from "./understood";
@@ -167,6 +167,7 @@ export class Compose {
       return;
     }
     this.inspection.stop();
+    const { files } = this.slots.given;
     this.sending = new AbortController();
     this.busy(true);
     const meter = h("progress", { max: 1, value: 0, "aria-label": "Upload" });
@@ -181,7 +182,8 @@ export class Compose {
       const job = await submit(form, this.key, onSent, this.sending.signal);
       this.key = null;
       this.answer.replaceChildren();
-      rememberFilm(job.id, this.slots.file("film"));
+      if (this.kept) rememberSame(job.id, this.kept.id);
+      else remember(job.id, files);
       this.onJob(job);
     } catch (error) {
       if (!(error instanceof Refusal && error.problem.status === 0)) this.key = null;
@@ -195,7 +197,7 @@ export class Compose {
   private keptForm(job: Job): FormData {
     const form = new FormData();
     form.append("inputs_of", job.id);
-    form.append("options", JSON.stringify(this.options.values()));
+    form.append("options", JSON.stringify({ ...this.options.values(), ...drawn(job.options) }));
     if (this.label.value.trim()) form.append("name", this.label.value.trim());
     return form;
   }
@@ -203,8 +205,7 @@ export class Compose {
   private form(): FormData | null {
     if (this.kept) return null;
     const form = new FormData();
-    const { region } = this.slots;
-    form.append("options", JSON.stringify({ ...this.options.values(), ...(region && { region_polygon: region }) }));
+    form.append("options", JSON.stringify({ ...this.options.values(), ...this.slots.region }));
     if (this.label.value.trim()) form.append("name", this.label.value.trim());
     const { files, grid } = this.slots.given;
     if (!files.some(([part]) => part === "tracks" || part === "film")) return null;

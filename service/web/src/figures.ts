@@ -20,7 +20,7 @@ function figures(job: Job): [string, string][] {
   const { num_frames: frames, num_points: points } = job.interpretation;
   if (frames > 0) rows.push(["Frames", whole.format(frames)]);
   if (points > 0) rows.push(["Points", whole.format(points)]); // none before a film is tracked
-  const { e3d_frame: error, reprojection_median: residual } = job.metrics ?? {};
+  const { e3d_frame_scaled: error, reprojection_median: residual } = job.metrics ?? {};
   if (error !== undefined) rows.push(["3-D error", `${ofSize(error)}, measured against the ground truth`]);
   if (residual !== undefined) rows.push(["Reprojection", inTracksUnit(residual, job)]);
   if (job.started_at && job.finished_at) rows.push(["Duration", duration((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)]);

@@ -1,6 +1,6 @@
 // Film files: recognising them, and decoding the first frame in the browser.
 
-import { type Entry, listing, unpacked } from "./peek";
+import { type Entry, type Member, listing, unpacked } from "./peek";
 import type { Inspection } from "./types";
 
 const FILMS = /\.(mp4|m4v|mov|webm|mkv|avi|gif|3gp)$/i;
@@ -25,15 +25,24 @@ export function looksLikeTracks(file: File, entries: Entry[]): boolean {
   return !looksLikeFilm(file, entries) && (entries.length > 0 || TRACKS.test(file.name));
 }
 
+/** Return true for the name of a picture, which may be a mask. */
+export function looksLikePicture(file: File): boolean {
+  return PICTURES.some(([pattern]) => pattern.test(file.name));
+}
+
+/** Return true for errors of a file that is truncated or not in the format of its name: the service will report them. */
+export function unreadable(error: unknown): boolean {
+  return error instanceof DOMException || error instanceof RangeError || error instanceof TypeError;
+}
+
 /** Return the first frame at the film's resolution, or null if this browser cannot decode it. */
 export async function firstFrame(file: File): Promise<ImageBitmap | null> {
   try {
     if (/\.gif$/i.test(file.name)) return await createImageBitmap(file);
-    if (/\.zip$/i.test(file.name)) return await firstPicture(file);
+    if (/\.zip$/i.test(file.name)) return await pictureAt(file, (await pictures(file))[0]);
     return await decoded(file);
   } catch (error) {
-    // The file is truncated or not in the format of its name: the service will report the error.
-    if (error instanceof DOMException || error instanceof RangeError || error instanceof TypeError) return null;
+    if (unreadable(error)) return null;
     throw error;
   }
 }
@@ -47,13 +56,18 @@ export async function servedFrame({ first_frame, image_size }: Inspection): Prom
   return createImageBitmap(picture, { resizeWidth: width, resizeHeight: height, resizeQuality: "high" });
 }
 
-async function firstPicture(file: File): Promise<ImageBitmap | null> {
+/** Return the pictures in a zip in the order of their numbers. */
+export async function pictures(file: File): Promise<Member[]> {
   const members = (await listing(file)).filter(({ name }) => !/(^|\/)(__MACOSX\/|\.)/.test(name));
-  const pictures = members.filter(({ name }) => PICTURES.some(([pattern]) => pattern.test(name)));
-  const [first] = pictures.sort((one, other) => one.name.localeCompare(other.name, "en", { numeric: true }));
-  if (first === undefined) return null;
-  const type = PICTURES.find(([pattern]) => pattern.test(first.name))?.[1] ?? "";
-  const picture = await unpacked(file, first, type);
+  const found = members.filter(({ name }) => PICTURES.some(([pattern]) => pattern.test(name)));
+  return found.sort((one, other) => one.name.localeCompare(other.name, "en", { numeric: true }));
+}
+
+/** Return one picture in a zip, or null if there is none or the browser cannot decompress it. */
+export async function pictureAt(file: File, member: Member | undefined): Promise<ImageBitmap | null> {
+  if (member === undefined) return null;
+  const type = PICTURES.find(([pattern]) => pattern.test(member.name))?.[1] ?? "";
+  const picture = await unpacked(file, member, type);
   return picture && createImageBitmap(picture);
 }
 

@@ -1,45 +1,73 @@
-// The film section of the form: advice, the first frame, and the region drawn on it.
+// The film section of the form: advice, a frame, and the region: drawn on that frame, or a mask picture.
 
 import { fill, button, h } from "./dom";
 import { RegionDialog } from "./draw";
 import { firstFrame } from "./film";
-import { type Point, type Region, described, paint, polygon } from "./region";
+import { openFrames } from "./frames";
+import { type Point, type Region, described, paint, paintMask, polygon } from "./region";
+import type { Options } from "./types";
 
 const ADVICE = "Tip: turn the object by 30° or more, and keep it sharp and large in the picture.";
 const UNDECODED =
   "This browser cannot decode the film. Its first frame appears here once the service has decoded it. " +
-  "Without a first frame, you cannot draw a region, and the whole picture is tracked.";
+  "Without a first frame, you cannot draw a region, but you can choose a mask picture. " +
+  "Without a region, everything in the picture is tracked, the background included.";
 /** Longest side of the small picture, in its own pixels. */
 const SIDE = 640;
 
+/** A region drawn on a frame, which is counted from 0. `picture` is that frame, or null for the first one. */
+interface Drawn {
+  region: Region;
+  frame: number;
+  picture: ImageBitmap | null;
+}
+
 export class Filming {
-  private readonly canvas = h("canvas", { role: "img", "aria-label": "First frame of the film" });
+  private readonly canvas = h("canvas", { role: "img" });
   private readonly words = h("p", { class: "hint", role: "status" });
   private readonly draw = button("Draw a region", () => this.edit());
-  private readonly clear = button("Whole picture", () => this.choose(null), { class: "quiet" });
+  private readonly masks = h("input", { type: "file", accept: "image/png,image/jpeg,image/webp,image/bmp", hidden: true, "aria-label": "Mask picture" });
+  private readonly clear = button("Remove the region", () => this.choose(null), { class: "quiet" });
   readonly element = h(
     "div",
     { class: "filming", hidden: true },
     h("p", { class: "hint" }, ADVICE),
     this.canvas,
     this.words,
-    h("div", { class: "row" }, this.draw, this.clear),
+    h("div", { class: "row" }, this.draw, button("Choose a mask picture", () => this.masks.click()), this.masks, this.clear),
   );
   private film: File | null = null;
   private picture: ImageBitmap | null = null;
   /** The first frame as the service decoded it, while the browser may still be decoding the film. */
   private served: ImageBitmap | null = null;
-  private region: Region | null = null;
+  private drawn: Drawn | null = null;
+  /** A mask picture instead of a drawn region; null for the picture if the browser cannot decode it. */
+  private masking: { file: File; picture: ImageBitmap | null } | null = null;
+  /** Number of frames according to the service; 0: unknown. */
+  private frames = 0;
   /** Whether the browser gave up decoding the film. */
   private undecoded = false;
   private shown: Promise<void> = Promise.resolve();
 
   /** `onChange` is called when the region has changed. */
-  constructor(private readonly onChange: () => void) {}
+  constructor(private readonly onChange: () => void) {
+    this.masks.addEventListener("change", () => {
+      const [file] = this.masks.files ?? [];
+      this.masks.value = "";
+      if (file) void this.useMask(file).then(this.onChange);
+    });
+  }
 
-  /** The option `region_polygon`; null: the whole picture. */
-  get outline(): Point[] | null {
-    return this.region && polygon(this.region);
+  /** The options for a drawn region; empty without one. */
+  get options(): Options {
+    if (this.drawn === null) return {};
+    const { region, frame } = this.drawn;
+    return { region_polygon: polygon(region), ...(frame > 0 && { region_frame: frame }) };
+  }
+
+  /** The mask picture; null: a drawn region, or the whole picture. */
+  get mask(): File | null {
+    return this.masking?.file ?? null;
   }
 
   /** Show another film, or none. */
@@ -47,10 +75,21 @@ export class Filming {
     this.shown = this.begin(film);
   }
 
-  /** Set a region as if it had been drawn, once the film is shown. */
+  /** Set a region as if it had been drawn on the first frame, once the film is shown. */
   async take(corners: Point[]): Promise<void> {
     await this.shown;
-    if (this.film) this.choose({ kind: "lasso", corners });
+    if (this.film) this.choose({ region: { kind: "lasso", corners }, frame: 0, picture: null });
+  }
+
+  /** Use a mask picture for the first frame instead of a drawn region. */
+  async useMask(file: File): Promise<void> {
+    this.release();
+    const masking: Filming["masking"] = { file, picture: null };
+    this.masking = masking;
+    const picture = await createImageBitmap(file).catch(() => null); // the service will report the error
+    masking.picture = picture;
+    if (this.masking === masking) this.update();
+    else picture?.close();
   }
 
   /** Show the first frame of the film as the service decoded it, if the browser cannot. */
@@ -60,11 +99,18 @@ export class Filming {
     if (this.undecoded) this.settle(null);
   }
 
+  /** Take the number of frames according to the service. */
+  count(film: File, frames: number): void {
+    if (this.film === film) this.frames = frames;
+  }
+
   private async begin(film: File | null): Promise<void> {
     this.film = film;
     this.picture?.close();
     this.served?.close();
-    this.picture = this.served = this.region = null;
+    this.release();
+    this.picture = this.served = null;
+    this.frames = 0;
     this.undecoded = false;
     this.element.hidden = film === null;
     this.write(film ? "Reading the first frame…" : "");
@@ -83,29 +129,51 @@ export class Filming {
     this.picture = decoded ?? this.served;
     if (decoded) this.served?.close();
     this.served = null;
-    this.write(this.picture ? described(this.region) : UNDECODED);
+    this.update();
   }
 
   private edit(): void {
-    if (this.picture) new RegionDialog(this.picture, this.region, (region) => this.choose(region)).open();
+    const { film, picture, drawn } = this;
+    if (film === null || picture === null) return;
+    const given = { region: drawn?.region ?? null, frame: drawn?.frame ?? 0, picture: drawn?.picture ?? picture };
+    const frames = this.undecoded ? Promise.resolve(null) : openFrames(film, this.frames);
+    new RegionDialog(given, frames, (done) => this.choose({ ...done, picture: done.picture === this.picture ? null : done.picture })).open();
   }
 
-  private choose(region: Region | null): void {
-    this.region = region;
-    this.write(described(region));
+  private choose(drawn: Drawn | null): void {
+    this.release(drawn?.picture);
+    this.drawn = drawn;
+    this.update();
     this.onChange();
   }
 
+  /** Forget the region, except a picture that is still used. */
+  private release(kept: ImageBitmap | null = null): void {
+    if (this.drawn?.picture !== kept) this.drawn?.picture?.close();
+    this.masking?.picture?.close();
+    this.drawn = this.masking = null;
+  }
+
+  private update(): void {
+    const { drawn, mask } = this;
+    if (mask) this.write(`Region: the mask picture ${mask.name}. What is white in it is tracked.`);
+    else if (this.picture) this.write(`${described(drawn?.region ?? null)}${drawn && drawn.frame > 0 ? ` Drawn on frame ${drawn.frame}.` : ""}`);
+    else this.write(this.undecoded ? UNDECODED : "Reading the first frame…");
+  }
+
   private write(words: string): void {
-    const { picture } = this;
+    const { drawn, masking } = this;
+    const picture = drawn?.picture ?? this.picture;
     fill(this.words, words, () => [words]);
     this.canvas.hidden = this.draw.hidden = picture === null;
-    this.clear.hidden = this.region === null;
-    this.draw.textContent = this.region ? "Change the region" : "Draw a region";
+    this.clear.hidden = drawn === null && masking === null;
+    this.draw.textContent = drawn ? "Change the region" : "Draw a region";
+    this.canvas.setAttribute("aria-label", drawn && drawn.frame > 0 ? `Frame ${drawn.frame} of the film` : "First frame of the film");
     if (picture === null) return;
     const scale = SIDE / Math.max(picture.width, picture.height);
     this.canvas.width = Math.round(picture.width * scale);
     this.canvas.height = Math.round(picture.height * scale);
-    paint(this.canvas, picture, this.outline ?? []);
+    paint(this.canvas, picture, drawn ? polygon(drawn.region) : []);
+    if (masking?.picture) paintMask(this.canvas, masking.picture);
   }
 }

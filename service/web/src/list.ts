@@ -5,7 +5,7 @@ import { button, fill, h, say } from "./dom";
 import { follow } from "./events";
 import { newer, progressed } from "./news";
 import { type Job, type Progress, isFinal } from "./types";
-import { badge, verdictOf } from "./verdict";
+import { badge, headline, verdictOf } from "./verdict";
 import { STATUS_WORDS, ago, count, percent, title } from "./words";
 
 /** Number of running jobs followed besides the one that is shown; browsers open at most six connections to a host. */
@@ -159,7 +159,7 @@ export class JobList {
     const about = [seen.mesh_source === "film" && "film", ...sizes, ago(job.created_at)].filter(Boolean).join(", ");
     say(row.about, about);
     const verdict = verdictOf(job);
-    fill(row.status, verdict ?? place(job), () => [verdict ? badge(verdict) : place(job)]);
+    fill(row.status, verdict ? headline(verdict, job) : place(job), () => [verdict ? badge(verdict, job) : place(job)]);
     row.status.dataset["status"] = job.status;
     row.meter.hidden = job.status !== "running";
     row.meter.value = job.progress?.fraction ?? 0;

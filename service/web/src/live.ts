@@ -4,16 +4,10 @@
 
 import { h, say } from "./dom";
 import { firstFrame } from "./film";
+import { sentFile } from "./sent";
 import type { Job } from "./types";
 
 type Followed = NonNullable<NonNullable<Job["progress"]>["followed"]>;
-
-const sent = new Map<string, File>();
-
-/** Keep the film of a submitted job while the tab is open. */
-export function rememberFilm(id: string, film: File | null): void {
-  if (film) sent.set(id, film);
-}
 
 export class LiveTracks {
   private readonly canvas = h("canvas", { role: "img", "aria-label": "The film with its tracked points" });
@@ -55,7 +49,7 @@ export class LiveTracks {
   }
 
   private async begin(): Promise<void> {
-    const film = sent.get(this.id);
+    const film = sentFile(this.id, "film");
     if (film === undefined) return this.draw();
     this.picture = await firstFrame(film);
     this.draw();

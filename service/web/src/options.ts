@@ -3,16 +3,16 @@
 import { h, uniqueId } from "./dom";
 import type { Options, Schema } from "./types";
 
-/** Not in the form: the region is drawn on the first frame. */
+/** Not in the form: the region is drawn on a frame of the film. */
 const DRAWN = ["region_polygon", "region_frame"];
 
 /** Collapsible groups of options by purpose. Options in none of them are in the group "Advanced". */
 const FOLDS: [string, string[]][] = [
   ["Files to write", ["outputs", "fps", "axes", "normals", "colours", "glb_motion", "glb_quantized"]],
-  ["Camera", ["camera", "focal", "field_of_view", "image_size", "principal_point"]],
+  ["Lens", ["camera", "focal", "field_of_view", "image_size", "principal_point"]],
   ["Frames and points", ["frames", "stride", "max_points", "min_seen", "order"]],
   ["Input format", ["layout", "rows", "coordinates", "coordinate_order", "y_axis", "visibility"]],
-  ["Film", ["template_frame", "grid_step", "longest_side"]],
+  ["Tracking a film", ["template_frame", "grid_step", "longest_side"]],
   ["Surface and smoothness", ["surface", "temporal_weight", "spatial_weight", "robust_scale"]],
 ];
 const EXPERTS = "Advanced";
@@ -54,7 +54,67 @@ const NAMES: Record<string, [string, string?]> = {
   refine_rotations: ["Refine cameras"],
 };
 
+/** Help for options whose description in the schema is meant for programs. “value: …” describes one choice. */
+const HELP: Record<string, string> = {
+  camera:
+    "perspective: a pinhole camera. scaled_orthographic: one scale per frame. orthographic: no scales. " +
+    "auto: perspective if the tracks are clearly more probable with it, else no perspective.",
+  focal: "In pixels of the tracks. If empty, it is estimated for a perspective camera.",
+  field_of_view: "Horizontal angle, instead of the focal length. Fill in the picture size too, unless the input is a film.",
+  principal_point: "For example 319.5,239.5. If empty: the centre of the picture, or that of the tracks if the picture size is unknown.",
+  surface:
+    "isometric: a sheet that bends without stretching, such as paper or cloth, seen in perspective. free: no such assumption. " +
+    "auto: isometric if the tracks are those of a sheet and its edge lengths determine a focal length; needs the picture size or the focal length.",
+  order:
+    "film: neighbouring frames are alike. any: photographs in no order, at most 360; needs the Gaussian prior. " +
+    "auto: any order if neighbouring frames are no more alike than others.",
+  basis_size: "Number of basis shapes in the factorization for the rotations. If empty, it is selected from the data.",
+  preset: "auto: weights that are not given are measured from noise and motion. paper: the published setting.",
+  temporal_weight: "Weight of smoothness in time, dimensionless. If empty: chosen by the preset.",
+  spatial_weight: "Weight of smoothness along the surface, dimensionless. If empty: chosen by the preset.",
+  robust_scale: "Residual at which the loss changes from quadratic to linear, in RMS radii of the tracks. If empty: chosen by the preset.",
+  temporal_order: "1 penalises velocity, 2 acceleration. Automatic: chosen by the preset. No effect with the Gaussian prior.",
+  loss: "Loss of the data term; used by the robust method only.",
+  laplacian: "An 8-direction stencil on a pixel grid, or a mesh Laplacian. Automatic: by the mesh.",
+  prior:
+    "gaussian: a Gaussian over the frames for the positions of each point, learned from the tracks; the only prior with an error estimate. It needs the " +
+    "robust method and the automatic preset. smooth: the published method; the error is not estimated. " +
+    "smooth+low_rank: also favours shapes that few basis shapes explain; the error is not estimated.",
+  low_rank_weight: "Weight of the low-rank prior, dimensionless. If empty, it is chosen from the data. No effect with other priors.",
+  precision: "Precision of the large arrays. The Gaussian prior needs float64.",
+  time_limit: "The job fails if it takes longer. If empty, only the service's own limit applies.",
+  outputs: "Written besides the NPZ file and the report. glTF: animated. PLY, OBJ: one mesh per frame, in a zip. MDD: point cache for Blender, Maya and Houdini. Tables: errors of every frame and of every point.",
+  normals:
+    "animated: they move with the shape, in glTF and in every frame of PLY, OBJ and USD. static: those of the first shape, in glTF only. " +
+    "none: viewers compute their own.",
+  colours:
+    "none: no colours. error: by the distance from the ground truth, or by the reprojection residual where there is none. " +
+    "expected_error: by the error that the solver expects, in percent of the object's size; only the Gaussian prior estimates it.",
+  axes: "viewer: y up, as in glTF. tracks: those of the tracks, as in the NPZ file.",
+  glb_quantized: "Positions of 16 bits and normals of 8 bits: about half the size, rounded to a 65,000th of the largest extent and half a degree.",
+  glb_motion:
+    "auto: as few modes of motion as keep every point within a thousandth of the bounding box's diagonal. " +
+    "frames: one morph target per frame, exact in single precision; up to 200 frames.",
+  layout: "auto: by the names in the file and by smoothness in time; an error if several fit.",
+  rows: "interleaved: rows are x1, y1, x2, y2 … stacked: all x, then all y. auto: from the data.",
+  coordinates:
+    "pixels: used unchanged, whatever their unit. unit: from 0 to 1. signed: from −1 to 1. " +
+    "auto: by the values; values from 0 to 1 are an error unless the picture size is given.",
+  image_size: "For example 640x480. Needed if coordinates are fractions of it. Its centre is the principal point of a perspective camera.",
+  coordinate_order: "auto: x before y, unless the points lie inside the picture only in the other order.",
+  frames: "Start:stop:step as in Python, for example 10:200:2. If empty: all frames.",
+  max_points: "Points are chosen evenly, and the mesh is simplified accordingly. If empty: all points.",
+  template_frame:
+    "Frame whose points are tracked in both directions, counted in the complete film from 0. If empty: the frame that the region is drawn on, or a sharp one in the middle without a region.",
+  grid_step: "Distance of neighbouring points in the film's pixels. If empty, it is chosen for about 4,000 points.",
+  longest_side: "Larger films are scaled down for tracking. Tracks remain in the film's own pixels.",
+};
+
 const LABELS: Record<string, string> = {
+  gaussian: "Gaussian",
+  "smooth+low_rank": "smooth and low rank",
+  grid8: "grid, 8 directions",
+  huber: "Huber",
   pseudo_inverse: "pseudo-inverse",
   spatio_temporal: "spatio-temporal",
   scaled_orthographic: "no perspective, scale per frame",
@@ -81,6 +141,11 @@ const LABELS: Record<string, string> = {
 /** Return the label of an option. */
 export function nameOf(name: string): string {
   return NAMES[name]?.[0] ?? sentence(name.replaceAll("_", " "));
+}
+
+/** Return the options of a job that describe its region, which the form does not contain. */
+export function drawn(options: Options): Options {
+  return Object.fromEntries(Object.entries(options).filter(([name, value]) => DRAWN.includes(name) && Boolean(value)));
 }
 
 interface Field {
@@ -168,10 +233,10 @@ export class OptionsForm {
     const control = controlFor(schema, id);
     const answer = h("div", { class: "slot-answer", "aria-live": "assertive" });
     this.fields.push({ name, schema, fold, answer, ...control });
-    const hint = h("p", { class: "hint", id: `${id}-hint` }, describe(schema, String(control.read() ?? "")));
+    const hint = h("p", { class: "hint", id: `${id}-hint` }, describe(name, schema, String(control.read() ?? "")));
     control.element.setAttribute("aria-describedby", hint.id);
     control.element.addEventListener("change", () => {
-      hint.textContent = describe(schema, String(control.read() ?? ""));
+      hint.textContent = describe(name, schema, String(control.read() ?? ""));
     });
     const unit = NAMES[name]?.[1];
     const group = control.element.getAttribute("role") === "group";
@@ -257,12 +322,14 @@ function label(value: unknown): string {
   return LABELS[String(value)] ?? String(value);
 }
 
-/** The part of a description that belongs to the chosen value ("robust: …"), or the whole description if there is none. */
-function describe(schema: Schema, chosen: string): string {
-  const text = schema.description ?? "";
-  const starts = (schema.enum ?? []).map((value) => text.indexOf(`${String(value)}: `)).filter((at) => at >= 0);
-  const from = text.indexOf(`${chosen}: `);
-  if (!chosen || !starts.includes(from)) return text;
+/** The part of a help text that belongs to the chosen value ("robust: …"), the part before all of these if there is none, or the whole text without such parts. */
+function describe(name: string, schema: Schema, chosen: string): string {
+  const text = HELP[name] ?? schema.description ?? "";
+  const place = (value: string): number => text.search(new RegExp(`(?<![\\w+])${value.replaceAll("+", "\\+")}: `));
+  const starts = (schema.enum ?? []).map((value) => place(String(value))).filter((at) => at >= 0);
+  if (!chosen || starts.length === 0) return text;
+  const from = place(chosen);
+  if (from < 0) return text.slice(0, Math.min(...starts)).trim();
   const to = Math.min(...starts.filter((at) => at > from), text.length);
   const part = text.slice(from + chosen.length + 2, to).replace(/[.;, ]+$/, "");
   return `${sentence(part)}.`;

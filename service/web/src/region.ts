@@ -1,5 +1,7 @@
 // A region of a film's picture: a rectangle or a lasso, in film pixels, y down.
 
+import { h } from "./dom";
+
 export type Point = [x: number, y: number];
 
 export interface Rectangle {
@@ -82,7 +84,7 @@ export function resized(region: Region, [dx, dy]: Point, size: Size): Rectangle 
 
 /** Return a description of a region. */
 export function described(region: Region | null): string {
-  if (region === null) return "No region: the whole picture is tracked.";
+  if (region === null) return "No region: everything in the picture is tracked, the background included. Draw around the object.";
   const { x, y, width, height } = bounds(polygon(region));
   const size = `${Math.round(width)} × ${Math.round(height)} pixels at ${Math.round(x)}, ${Math.round(y)}`;
   return region.kind === "rectangle" ? `Rectangle, ${size}.` : `Lasso with ${region.corners.length} corners, ${size}.`;
@@ -111,6 +113,25 @@ export function paint(canvas: HTMLCanvasElement, picture: ImageBitmap, outline: 
     context.lineWidth = times * width;
     context.stroke(path);
   }
+}
+
+/** Darken everything outside a mask picture on a canvas, by the service's rule: dark is outside, or transparent if a part is transparent. */
+export function paintMask(canvas: HTMLCanvasElement, mask: ImageBitmap): void {
+  const { width, height } = canvas;
+  const layer = h("canvas", { width, height });
+  const context = layer.getContext("2d") as CanvasRenderingContext2D;
+  context.drawImage(mask, 0, 0, width, height);
+  const shade = context.getImageData(0, 0, width, height);
+  const { data } = shade;
+  let isTransparent = false;
+  for (let i = 3; i < data.length; i += 4) isTransparent ||= (data[i] as number) < 128;
+  for (let i = 0; i < data.length; i += 4) {
+    const [red, green, blue, alpha] = data.subarray(i, i + 4) as unknown as [number, number, number, number];
+    const isInside = isTransparent ? alpha >= 128 : 0.299 * red + 0.587 * green + 0.114 * blue >= 128;
+    data.set([0, 0, 0, isInside ? 0 : 128], i);
+  }
+  context.putImageData(shade, 0, 0);
+  canvas.getContext("2d")?.drawImage(layer, 0, 0);
 }
 
 function bounds(corners: Point[]): Omit<Rectangle, "kind"> {

@@ -8,11 +8,12 @@ import { bytes, number, unbroken } from "./words";
 
 /** Title and meaning of each metric, shown beside its name in the record. */
 const METRICS: Record<string, [string, string]> = {
-  e3d_frame: ["3-D error", "distance from the ground truth after the best rotation of each frame; share of the object's size"],
-  e3d_frame_scaled: ["3-D error, one scale", "the same after one scale for the whole sequence"],
+  e3d_frame_scaled: ["3-D error", "distance from the ground truth after rotating each frame and scaling all; share of the object's size"],
+  e3d_frame: ["3-D error without scale", "the same without the scale; result and ground truth must have one unit"],
   e3d_sequence: ["3-D error, one alignment", "the same after one orthogonal alignment for the whole sequence"],
   e3d_frame_similarity: ["Shape error", "the same after rotating, mirroring and scaling each frame to fit"],
   e3d_mocap: ["3-D error, motion capture", "as the motion capture literature defines it; share of the shape's spread"],
+  size_ratio: ["Size ratio", "size of the ground truth divided by the result's; far from 1, their units differ and only scaled errors have a meaning"],
   coverage: ["Coverage", "share of the positions within their 90\u00a0% interval"],
   reprojection_median: ["Reprojection, median", "median distance from a visible track to the projected shape, in the tracks' unit"],
   reprojection_rms: ["Reprojection, root mean square", "root mean square of the same distances; sensitive to outliers"],

@@ -1,21 +1,23 @@
 // The files of a new job: a film, or tracks with a mesh. Each slot accepts a dropped or chosen file and shows its contents.
 
 import { CameraDialog, canRecord } from "./camera";
-import { button, h, uniqueId } from "./dom";
-import { looksLikeFilm, looksLikeTracks, servedFrame } from "./film";
+import { button, h, say, uniqueId } from "./dom";
+import { looksLikeFilm, looksLikePicture, looksLikeTracks, servedFrame } from "./film";
 import { Filming } from "./filming";
 import { type Entry, describe, peek } from "./peek";
 import type { Point } from "./region";
-import { type Inspection, PARTS, type Part } from "./types";
+import { type Inspection, type Options, PARTS, type Part } from "./types";
 import { bytes } from "./words";
 
 export const PLACES: Record<Part, { label: string; hint: string }> = {
-  film: { label: "Film", hint: "mp4, mov, webm, avi, gif, zip of pictures" },
+  film: { label: "Film", hint: "mp4, mov, webm, mkv, avi, gif, zip of pictures" },
   tracks: { label: "Tracks", hint: "npz, npy, mat, csv …" },
-  mesh: { label: "Mesh", hint: "optional: obj, ply, glb, npz" },
+  mesh: { label: "Mesh", hint: "optional: obj, ply, glb, npz, or a png mask of the points" },
   ground_truth: { label: "Ground truth", hint: "optional: used to measure errors" },
   rotations: { label: "Cameras", hint: "optional: if known" },
 };
+
+const MASK_AS_MESH = "A mask of the points: each pixel that is not black is a point.";
 
 interface Slot {
   row: HTMLElement;
@@ -34,12 +36,14 @@ export class Slots {
   private readonly slots = new Map<Part, Slot>();
   private readonly filming = new Filming(() => this.onChange());
   private readonly title = h("p", { class: "zone-title" }, "Drop tracks and a mesh here");
+  /** Which of the dropped or chosen files were left out, and why. */
+  private readonly leftOut = h("p", { class: "left-out", role: "status" });
   private readonly grid = h("input", { type: "text", id: "grid", placeholder: "rows×columns", size: 10, autocomplete: "off" });
 
   /** `onChange` is called when the files or the region have changed. */
   constructor(private readonly onChange: () => void) {
     const promise = h("p", { class: "hint" }, "Files are sent to this service only.");
-    this.element.append(this.title, promise, ...PARTS.map((part) => this.slot(part)));
+    this.element.append(this.title, promise, this.leftOut, ...PARTS.map((part) => this.slot(part)));
     this.arrange();
     this.grid.addEventListener("change", onChange);
     this.acceptDrops();
@@ -53,17 +57,18 @@ export class Slots {
   }
 
   /** The files to submit, and the size of a grid if there is no mesh file. A film is submitted alone: the service tracks it. */
-  get given(): { files: [Part, File][]; grid: string } {
+  get given(): { files: [Part | "region", File][]; grid: string } {
     const film = this.file("film");
-    if (film) return { files: [["film", film]], grid: "" };
+    const { mask } = this.filming;
+    if (film) return { files: [["film", film], ...(mask ? [["region", mask] as ["region", File]] : [])], grid: "" };
     const files = PARTS.map((part): [Part, File | null] => [part, this.file(part)]);
     const grid = this.file("mesh") ? "" : this.grid.value.trim().replace("×", "x");
     return { files: files.filter((one): one is [Part, File] => one[1] !== null), grid };
   }
 
-  /** The region to track in the film: corners in film pixels; null: the whole picture. */
-  get region(): Point[] | null {
-    return this.file("film") && this.filming.outline;
+  /** The options for the region drawn on the film; empty without one. */
+  get region(): Options {
+    return this.file("film") ? this.filming.options : {};
   }
 
   file(part: Part): File | null {
@@ -104,22 +109,51 @@ export class Slots {
     await this.filming.take(corners);
   }
 
-  /** Take the interpretation of the current files: it may have the first frame of a film that the browser cannot decode. */
+  /** Take the interpretation of the current files: the number of a film's frames, and the first one for browsers that cannot decode it. */
   async seen(seen: Inspection): Promise<void> {
     const film = this.file("film");
+    if (film) this.filming.count(film, seen.given_frames ?? 0);
     const picture = film && (await servedFrame(seen).catch(() => null)); // not a picture after all
     if (picture) this.filming.offer(film, picture);
   }
 
   /** Assign dropped files to slots by their names and contents. */
   async take(files: File[]): Promise<void> {
-    for (const file of files) {
-      const entries = await peek(file);
-      const part = this.hasFilms && looksLikeFilm(file, entries) ? "film" : roleOf(file.name, entries, this.file("tracks") !== null);
-      await this.show(part, file);
+    const read = await Promise.all(files.map(async (file): Promise<[File, Entry[]]> => [file, await peek(file)]));
+    // The meaning of the other files depends on the film or the tracks.
+    const rank = ([file, entries]: [File, Entry[]]): number =>
+      looksLikeFilm(file, entries) ? 0 : looksLikeTracks(file, entries) && roleOf(file.name, entries, false) === "tracks" ? 1 : 2;
+    const leftOut: string[] = [];
+    for (const [file, entries] of read.sort((one, other) => rank(one) - rank(other))) {
+      const part = this.placeOf(file, entries);
+      if (part === null) leftOut.push(file.name);
+      else if (part === "region") await this.filming.useMask(file);
+      else await this.show(part, file);
       if (part === "tracks") await this.show("film", null); // the last drop wins
     }
-    if (files.length > 0) this.onChange();
+    if (files.length > 0) await this.settle(leftOut);
+  }
+
+  /** Return the part that a dropped file belongs to; null if it is of an unknown kind, or does not belong to a film. */
+  private placeOf(file: File, entries: Entry[]): Part | "region" | null {
+    if (this.hasFilms && looksLikeFilm(file, entries)) return "film";
+    const part = roleOf(file.name, entries, this.file("tracks") !== null);
+    const isKnown = looksLikeTracks(file, entries) || looksLikePicture(file) || NAMED.some(([, pattern]) => pattern.test(file.name));
+    if (this.file("film") === null) return isKnown || this.main === null ? part : null;
+    if (looksLikePicture(file)) return "region";
+    return part === "tracks" && looksLikeTracks(file, entries) ? part : null;
+  }
+
+  /** Report the files that were left out; a picture chosen as a mesh before its film is the film's mask. */
+  private async settle(leftOut: string[] = []): Promise<void> {
+    const [film, mesh] = [this.file("film"), this.file("mesh")];
+    if (film && mesh && looksLikePicture(mesh)) {
+      await this.show("mesh", null);
+      await this.filming.useMask(mesh);
+    }
+    const belongs = film ? "Only a mask picture can be added to a film." : "This page does not know files of this kind.";
+    say(this.leftOut, leftOut.length > 0 ? `Left out: ${leftOut.join(", ")}. ${belongs}` : "");
+    this.onChange();
   }
 
   private slot(part: Part): HTMLElement {
@@ -158,16 +192,24 @@ export class Slots {
 
   private async put(part: Part, file: File | null): Promise<void> {
     const meant = file === null ? part : await this.meant(part, file);
-    if (meant !== part) await this.show(part, null);
-    await this.show(meant, file);
-    this.onChange();
+    if (meant === null) {
+      (this.slots.get(part) as Slot).input.value = "";
+      return this.settle([(file as File).name]);
+    }
+    if (meant === "region") await this.filming.useMask(file as File);
+    else {
+      if (meant !== part) await this.show(part, null);
+      await this.show(meant, file);
+    }
+    await this.settle();
   }
 
-  /** Return the part that a chosen file belongs to: film for a film chosen as tracks, tracks for the reverse. */
-  private async meant(part: Part, file: File): Promise<Part> {
-    if (part === "tracks" && this.hasFilms && looksLikeFilm(file, await peek(file))) return "film";
-    if (part === "film" && looksLikeTracks(file, await peek(file))) return "tracks";
-    return part;
+  /** Return the part that a chosen file belongs to: film for a film chosen as tracks, tracks for the reverse; as `placeOf` while a film is chosen. */
+  private async meant(part: Part, file: File): Promise<Part | "region" | null> {
+    const entries = await peek(file);
+    if (part === "tracks" && this.hasFilms && looksLikeFilm(file, entries)) return "film";
+    if (part === "film" && looksLikeTracks(file, entries)) return "tracks";
+    return part === "film" && this.file("film") ? this.placeOf(file, entries) : part;
   }
 
   private async show(part: Part, file: File | null): Promise<void> {
@@ -187,7 +229,7 @@ export class Slots {
       return;
     }
     const entries = await peek(file);
-    if (slot.file === file && entries.length > 0) slot.contents.textContent = describe(entries);
+    if (slot.file === file) slot.contents.textContent = part === "mesh" && looksLikePicture(file) ? MASK_AS_MESH : describe(entries);
   }
 
   /** A film replaces the slots of tracks, mesh, ground truth and cameras. */
@@ -218,7 +260,7 @@ const WITHIN: [Part, RegExp][] = [
   ["rotations", /^(rotations|Rs|R)$/],
 ];
 const NAMED: [Part, RegExp][] = [
-  ["mesh", /\.(obj|ply|glb|gltf|png)$/i],
+  ["mesh", /\.(obj|ply|glb|gltf|png)$/i], // a picture without a film is a mask of the points
   ["ground_truth", /truth|(^|[_-])gt([_.-]|$)/i],
   ["rotations", /rotation|camera/i],
   ["mesh", /mesh|faces/i],

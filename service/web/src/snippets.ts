@@ -2,6 +2,7 @@
 
 import { getOptions } from "./api";
 import { button, fill, h } from "./dom";
+import { sentNames } from "./sent";
 import type { Job, Schema } from "./types";
 
 type Language = "Python" | "Shell" | "curl";
@@ -69,16 +70,28 @@ function given(job: Job, schema: Schema): Given {
   return Object.entries(job.options).filter(([name, value]) => differs(name, value));
 }
 
-/** The parts of the form, with placeholder file names; a grid is given by its size, and a missing mesh as "none". */
-function parts(job: Job): [string, string][] {
+interface FormPart {
+  part: string;
+  value: string;
+  isFile: boolean;
+}
+
+/**
+ * The parts of the form. Files have their own names if this tab has sent them, else placeholders; a grid is given by its size, and a missing
+ * mesh as "none".
+ */
+function parts(job: Job): [FormPart, ...FormPart[]] {
   const seen = job.interpretation;
-  if (ofFilm(job)) return [["film", "film.mp4"]];
-  const found: [string, string][] = [["tracks", "tracks.npz"]];
-  if (seen.mesh_grid) found.push(["mesh", seen.mesh_grid.join("x")]);
-  else if (seen.mesh_source === "given" || seen.mesh_source === "grid") found.push(["mesh", "mesh.npz"]);
-  else if (seen.mesh_source === "none") found.push(["mesh", "none"]);
-  if (seen.has_ground_truth) found.push(["ground_truth", "truth.npz"]);
-  if (seen.has_rotations) found.push(["rotations", "cameras.npz"]);
+  const names = sentNames(job.retry_of && !sentNames(job.id)["film"] ? job.retry_of : job.id);
+  const file = (part: string, placeholder: string): FormPart => ({ part, value: names[part] ?? placeholder, isFile: true });
+  if (ofFilm(job)) return [file("film", "film.mp4"), ...(names["region"] ? [file("region", "")] : [])];
+  const found: [FormPart, ...FormPart[]] = [file("tracks", "tracks.npz")];
+  if (names["mesh"]) found.push(file("mesh", ""));
+  else if (seen.mesh_grid) found.push({ part: "mesh", value: seen.mesh_grid.join("x"), isFile: false });
+  else if (seen.mesh_source === "given" || seen.mesh_source === "grid") found.push(file("mesh", "mesh.npz"));
+  else if (seen.mesh_source === "none") found.push({ part: "mesh", value: "none", isFile: false });
+  if (seen.has_ground_truth) found.push(file("ground_truth", "truth.npz"));
+  if (seen.has_rotations) found.push(file("rotations", "cameras.npz"));
   return found;
 }
 
@@ -95,31 +108,34 @@ function python(job: Job, chosen: Given, url: string): string {
   const literal = (value: unknown): string =>
     value === true ? "True" : value === false ? "False" : JSON.stringify(value);
   const options = chosen.map(([name, value]) => `${JSON.stringify(name)}: ${literal(value)}`).join(", ");
-  const files = parts(job)
-    .slice(1)
-    .map(([part, file]) => `    ${part}=${JSON.stringify(file)},\n`);
+  const [main, ...others] = parts(job);
+  const files = others.map(({ part, value }) => `    ${part}=${JSON.stringify(value)},\n`);
+  const first = `${main.part === "film" ? "film=" : ""}${JSON.stringify(main.value)}`;
+  const { num_frames, num_points } = job.interpretation;
   const name = job.name ? `    name=${JSON.stringify(job.name)},\n` : "";
   return (
     `from pliant.client import Client\n\n` +
-    `job = Client(${JSON.stringify(url)}).submit(\n    ${ofFilm(job) ? 'film="film.mp4"' : '"tracks.npz"'},\n${files.join("")}${name}${options ? `    options={${options}},\n` : ""})\n` +
-    `shapes = job.wait(timeout=3600).shapes  # array (${job.interpretation.num_frames}, ${job.interpretation.num_points}, 3)\n`
+    `job = Client(${JSON.stringify(url)}).submit(\n    ${first},\n${files.join("")}${name}${options ? `    options={${options}},\n` : ""})\n` +
+    `shapes = job.wait(timeout=3600).shapes  # array (${num_frames || "frames"}, ${num_points || "points"}, 3)\n`
   );
 }
 
 const quote = (text: string): string => (/^[\w@%+=:,./-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 
+/** A file name in curl's option -F, where commas and semicolons separate fields. */
+const inField = (name: string): string => (/[,;"]/.test(name) ? `"${name.replace(/["\\]/g, "\\$&")}"` : name);
+
 function shell(job: Job, chosen: Given, url: string): string {
-  const files = parts(job)
-    .slice(1)
-    .map(([part, file]) => `--${part.replace("_", "-")} ${file}`);
+  const [main, ...others] = parts(job);
+  const files = others.map(({ part, value }) => `--${part.replace("_", "-")} ${quote(value)}`);
   const options = chosen.map(([name, value]) => `--option ${quote(`${name}=${typeof value === "object" ? JSON.stringify(value) : String(value)}`)}`);
   const name = job.name ? [`--name ${quote(job.name)}`] : [];
-  return `${[`pliant submit ${ofFilm(job) ? "film.mp4" : "tracks.npz"}`, ...files, ...name, `--url ${quote(url)}`, ...options, "--output result"].join(" \\\n  ")}\n`;
+  return `${[`pliant submit ${quote(main.value)}`, ...files, ...name, `--url ${quote(url)}`, ...options, "--output result"].join(" \\\n  ")}\n`;
 }
 
 function curl(job: Job, chosen: Given, url: string): string {
   const fields = [
-    ...parts(job).map(([part, file]) => `-F ${part}=${/\.(npz|mp4)$/.test(file) ? "@" : ""}${file}`),
+    ...parts(job).map(({ part, value, isFile }) => `-F ${quote(isFile ? `${part}=@${inField(value)}` : `${part}=${value}`)}`),
     ...(job.name ? [`-F ${quote(`name=${job.name}`)}`] : []),
     ...(chosen.length > 0 ? [`-F ${quote(`options=${JSON.stringify(Object.fromEntries(chosen))}`)}`] : []),
   ];

@@ -2,7 +2,7 @@
 
 import { button, say } from "./dom";
 import { type Job, isFinal } from "./types";
-import { VERDICTS, verdictOf } from "./verdict";
+import { headline, verdictOf } from "./verdict";
 import { STATUS_WORDS, percent, title } from "./words";
 
 const PLAIN = "Pliant";
@@ -52,5 +52,5 @@ function lead(job: Job): string {
 /** The verdict if there is one, else the status of the job. */
 function outcome(job: Job): string {
   const verdict = verdictOf(job);
-  return verdict ? VERDICTS[verdict] : STATUS_WORDS[job.status];
+  return verdict ? headline(verdict, job) : STATUS_WORDS[job.status];
 }

@@ -14,10 +14,26 @@ const MESHES: Record<string, string> = {
   film: "from the grid of tracked points",
 };
 
+/** The service's notes, except the one on a film's size and frames, which `facts` contains. */
+function notesOf(seen: Interpretation): string[] {
+  return seen.notes.filter((note) => seen.num_points > 0 || !note.startsWith("A film of "));
+}
+
 /** The interpretation of the inputs, as terms and descriptions. */
 function facts(seen: Interpretation): [string, string][] {
   // The points of a film are not known until the job tracks it.
-  if (seen.num_points === 0) return [["Film", seen.num_frames > 0 ? count(seen.num_frames, "frame") : "frames not counted yet"]];
+  if (seen.num_points === 0) {
+    const [size, fps] = [seen.image_size?.replace("x", "×"), seen.fps];
+    const film = [
+      size ? `${size} pixels` : "",
+      seen.num_frames > 0 ? count(seen.num_frames, "frame") : "",
+      fps ? `${Number(fps.toPrecision(3))} frames per second` : "",
+    ].filter(Boolean);
+    return [
+      ["Film", film.join(", ") || "as given"],
+      ["Points", "tracked when the job runs"],
+    ];
+  }
   return [
     ["Tracks", `${count(seen.num_frames, "frame")} of ${count(seen.num_points, "point")}, ${percent(seen.hidden_fraction)} hidden`],
     ["Layout", `${seen.layout}, y ${seen.y_axis}`],
@@ -52,7 +68,7 @@ export class Understood {
 
   show(job: Job): void {
     const method: [string, string] = ["Method", `${String(job.options["method"])}, preset ${String(job.options["preset"])}`];
-    this.facts.show([...facts(job.interpretation), method], job.interpretation.notes);
+    this.facts.show([...facts(job.interpretation), method], notesOf(job.interpretation));
   }
 }
 
@@ -129,7 +145,7 @@ export class Inspection {
     try {
       const seen = await inspect(form, asking.signal);
       if (asking.signal.aborted) return;
-      this.facts.show(facts(seen), seen.notes);
+      this.facts.show(facts(seen), notesOf(seen));
       this.found.hidden = false;
       this.glimpse.show(seen.sample ?? []);
       this.onSeen(seen);

@@ -4,7 +4,7 @@ import { fill, h, svg } from "./dom";
 import type { Job, Verdict } from "./types";
 import { percent, unbroken } from "./words";
 
-export const VERDICTS: Record<Verdict, string> = { good: "Good", with_care: "Use with care", do_not_use: "Do not use" };
+const VERDICTS: Record<Verdict, string> = { good: "Good", with_care: "Use with care", do_not_use: "Do not use" };
 
 /** A shape for each verdict, so that colour is not the only difference. */
 const ICONS: Record<Verdict, [outline: string, sign: string]> = {
@@ -13,8 +13,20 @@ const ICONS: Record<Verdict, [outline: string, sign: string]> = {
   do_not_use: ["M5 1h6l4 4v6l-4 4H5l-4-4V5z", "M5.4 5.4l5.2 5.2M10.6 5.4l-5.2 5.2"],
 };
 
+/** Start of the service's sentence on a result whose error it cannot estimate. */
+const UNESTIMATED = "The error is not estimated";
+
+/** Return the verdict in words; a verdict without an error estimate must not read like one that has it. */
+export function headline(verdict: Verdict, job: Job): string {
+  return isUnestimated(job) ? `${VERDICTS[verdict]}, error not estimated` : VERDICTS[verdict];
+}
+
+function isUnestimated(job: Job): boolean {
+  return job.trust_sentence?.startsWith(UNESTIMATED) ?? false;
+}
+
 /** Return the badge of a verdict. */
-export function badge(verdict: Verdict): HTMLElement {
+export function badge(verdict: Verdict, job: Job): HTMLElement {
   const [outline, sign] = ICONS[verdict];
   const icon = svg(
     "svg",
@@ -22,7 +34,7 @@ export function badge(verdict: Verdict): HTMLElement {
     svg("path", { d: outline, class: "badge-outline" }),
     svg("path", { d: sign, class: "badge-sign" }),
   );
-  return h("span", { class: "badge", "data-verdict": verdict }, icon, VERDICTS[verdict]);
+  return h("span", { class: isUnestimated(job) ? "badge unestimated" : "badge", "data-verdict": verdict }, icon, headline(verdict, job));
 }
 
 /** Return the verdict of a finished job, or null if it has none or an unknown one. */
@@ -58,7 +70,7 @@ export class VerdictBox {
     if (verdict === null) return;
     this.element.dataset["verdict"] = verdict;
     const reasons = job.verdict_reasons ?? [];
-    fill(this.badge, verdict, () => [badge(verdict)]);
+    fill(this.badge, headline(verdict, job), () => [badge(verdict, job)]);
     fill(this.trust, job.trust_sentence ?? "", () => [unbroken(job.trust_sentence ?? "")]);
     fill(this.reasons, reasons.join("\n"), () => reasons.map((reason) => h("li", {}, unbroken(reason))));
     fill(this.outcome, job.sentence ?? "", () => [job.sentence && `Solver: ${job.sentence}`]);

@@ -125,6 +125,14 @@ def test_a_region_can_be_an_array_or_a_file(inside: object, tmp_path: Path) -> N
         (lambda here: tracks_file([[1.0], [2.0, 3.0]], None, here), "got a value of type list that is none. Pad ragged lists"),
         (lambda here: tracks_file(b"x", None, here), "tracks: expected an array of numbers"),
         (lambda here: mesh_part(object(), here), "mesh: expected an array of numbers or booleans, got a value of type object"),
+        (
+            lambda here: Inputs(tracks=None, film="nofilm.mp4").form(here, {}, None),
+            r"^film: expected the path of a film, got no file at nofilm\.mp4\. Check the path\.$",
+        ),
+        (
+            lambda here: region_part("nomask.png", here),
+            r"^region: expected the path of a mask picture, or an array \(H, W\), got no file at nomask\.png",
+        ),
         (lambda here: existing_file(POINTS, "film"), "film: expected the path of a file, got a value of type ndarray"),
         (lambda here: region_part(POINTS, here), r"region: expected the path .* of bool or uint8, got an array of shape \(4, 9, 2\)"),
         (lambda here: region_part(POINTS[0], here), r"dtype float32\. Convert it; a polygon is the option region_polygon"),

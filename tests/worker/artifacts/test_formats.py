@@ -163,7 +163,7 @@ def test_csv_tables_agree_with_the_metrics(tmp_path: Path) -> None:
     files = write(tmp_path, made)
     frames, points = rows_of(files["metrics_frames.csv"]), rows_of(files["metrics_points.csv"])
     metrics = evaluate(solution, inputs.tracks, inputs.ground_truth.shapes)
-    for name in ("e3d_sequence", "e3d_frame", "e3d_frame_similarity"):
+    for name in ("e3d_sequence", "e3d_frame", "e3d_frame_scaled", "e3d_frame_similarity"):
         assert 0 < frames[name].mean() == pytest.approx(metrics[name], rel=1e-12)
     np.testing.assert_array_equal(frames["seconds"], np.arange(7) / 12.5)
     np.testing.assert_array_equal(points["point"], np.arange(30))

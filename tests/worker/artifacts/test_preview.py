@@ -108,8 +108,10 @@ def test_projections_plus_residuals_give_the_tracks(sequence: Sequence, tmp_path
     assert header["num_faces"] == 0
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_truth_is_aligned_as_for_e3d_frame(sequence: Sequence, tmp_path: Path, mirrored: bool) -> None:
+@pytest.mark.parametrize(("mirrored", "unit"), [(False, 1.0), (True, 1000.0)])
+def test_truth_is_aligned_and_scaled_to_the_result(
+    sequence: Sequence, tmp_path: Path, mirrored: bool, unit: float
+) -> None:
     turned = sequence.shapes @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0] + 5.0
     if (
         np.linalg.det(
@@ -120,6 +122,7 @@ def test_truth_is_aligned_as_for_e3d_frame(sequence: Sequence, tmp_path: Path, m
         turned = turned * (1.0, 1.0, -1.0)
     truth = turned + np.random.default_rng(2).normal(scale=2.0, size=turned.shape)
     truth[:, 7] = np.nan
+    truth *= unit
     solution = solution_of(sequence, mirrored=mirrored)
     path = tmp_path / preview.NAME
     write(path, tracks=sequence.tracks, mesh=sequence.mesh, solution=solution, truth=truth)
@@ -127,8 +130,8 @@ def test_truth_is_aligned_as_for_e3d_frame(sequence: Sequence, tmp_path: Path, m
     assert header["mirrored"] is mirrored
     known = np.arange(P) != 7
     apart = np.linalg.norm(world(header, arrays["truth"]) - world(header, arrays["positions"]), axis=2)
-    expected = align(solution.shapes[:, known], truth[:, known]).distances
-    np.testing.assert_allclose(apart[:, known], expected, atol=2 * header["step"])
+    expected = align(solution.shapes[:, known], truth[:, known], kind="frame_scaled")
+    np.testing.assert_allclose(apart[:, known], expected.distances / expected.scales[0], atol=2 * header["step"])
     assert (apart[:, 7] == 0).all()
 
 

@@ -39,6 +39,11 @@ export class FilmPane {
     new ResizeObserver(() => this.draw()).observe(this.canvas);
   }
 
+  /** Width of the picture divided by its height. */
+  get shape(): number {
+    return this.frame.width / this.frame.height;
+  }
+
   theme(dots: string, wire: string): void {
     this.colours = { ...this.colours, dots, wire };
     this.draw();

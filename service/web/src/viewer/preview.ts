@@ -84,7 +84,7 @@ export interface FrameFacts {
   hidden: number | null;
   /** Expected error, a share of the object's size. */
   expected: number | null;
-  /** `e3d_frame`, if ground truth was given. */
+  /** `e3d_frame_scaled`, if ground truth was given. */
   error: number | null;
   translation: [number, number];
 }

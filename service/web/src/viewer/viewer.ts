@@ -20,6 +20,9 @@ import { type Side, Stage } from "./stage";
 import { Timeline } from "./timeline";
 import { TrackDots } from "./tracks";
 
+/** Pictures of at least this width over height are larger below each other than beside each other on a usual screen. */
+const WIDE = 1.5;
+
 /** The files that the viewer shows, and related jobs. */
 export interface Sources {
   title: string;
@@ -315,11 +318,15 @@ export class Viewer {
     await this.guarded(async () => {
       if (!on) {
         this.pane?.canvas.parentElement?.remove();
+        this.panes.removeAttribute("style");
+        this.panes.classList.remove("wide");
         this.pane = null;
         this.check("over", false);
       } else if (this.pane === null) {
         this.pane = new FilmPane(this.preview, await this.preview.field("residuals", this.leaving.signal), this.film);
         this.panes.prepend(h("div", { class: "view film" }, this.pane.canvas));
+        this.panes.style.setProperty("--shape", String(this.pane.shape));
+        this.panes.classList.toggle("wide", this.pane.shape >= WIDE);
         this.repaint();
       }
       this.check("beside", on);
