@@ -92,6 +92,16 @@ def test_the_time_estimate_is_within_a_factor_of_two_of_measurements(
     assert seconds / 2 < estimate.seconds < 2 * seconds
 
 
+@pytest.mark.parametrize("measured", [1.3, 1.9, 2.7, 3.5])
+def test_the_time_with_perspective_is_within_a_factor_of_two_of_measurements(measured: float) -> None:
+    plain = estimated(50, 500, Options())
+    near = estimated(50, 500, Options(image_size="640x480"))
+    assert measured / 2 < near.seconds / plain.seconds < 2 * measured
+    assert near.memory_bytes == plain.memory_bytes
+    assert estimated(50, 500, Options(focal=500)) == estimated(50, 500, Options(camera="perspective")) == near
+    assert estimated(50, 500, Options(image_size="640x480", camera="orthographic")) == plain
+
+
 MEMORY = ((50, 20_000, "gaussian", 0.34e9), (10, 60_000, "smooth", 0.24e9), (30, 20_000, "smooth+low_rank", 0.31e9),
           (50, 200_000, "gaussian", 2.9e9), (100, 1_000_000, "gaussian", 11.6e9))  # fmt: skip
 """Frames, points, prior, and measured peak memory in bytes: the first three in jobs, the others in the solver."""
