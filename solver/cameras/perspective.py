@@ -24,7 +24,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.limits import LEARNED_FRAMES
 from pliant.solver.model.image_density import Explained, ImageModel
 from pliant.solver.model.marginal_likelihood import root_matrix
@@ -111,16 +110,8 @@ class Perspective:
     sample: Floats = field(default_factory=lambda: np.zeros((0, 0, 2)))
     """Sampled complete tracks, uncorrected, relative to the principal point, shape `(F, S, 2)`, normalized units."""
 
-    often_seen: NDArray[np.bool_] = field(default_factory=lambda: np.ones(0, dtype=bool))
-    """The points of the sample from which perspective is learned, shape `(S,)`; empty for all."""
-
     depth: Floats | DepthMap = field(default_factory=lambda: np.zeros((0, 0)))
     """D of the latest cameras and covariance, shape `(F, 2F)`."""
-
-    @property
-    def views(self) -> Floats:
-        """The part of the sample from which perspective is learned, shape `(F, S', 2)`."""
-        return self.sample[:, self.often_seen] if len(self.often_seen) else self.sample
 
     @property
     def bends(self) -> bool:

@@ -124,7 +124,7 @@ def aligned(rotations: Floats, like: Floats, used: NDArray[np.intp]) -> Floats:
 
 
 def _relearned(view: Perspective, found: Learned, used: NDArray[np.intp], model_order: ModelOrder) -> Learned:
-    views = view.views[used]
+    views = view.sample[used]
     depths = depths_of(depth_map(found.rotations, found.scales, found.covariance), views, view.curvature)
     rows = columns(centred(corrected(views, depths, view.curvature)))
     projections = found.rotations[:, :2] * found.scales[:, None, None]
@@ -144,6 +144,6 @@ def _with_focal(
 ) -> tuple[Learned, Perspective]:
     zooms = bool((found.scales != 1).any())
     found, curvature = refined_with_focal(
-        view.views[used], found, view.curvature, free=view.given is None, turning=turning, with_scales=zooms
+        view.sample[used], found, view.curvature, free=view.given is None, turning=turning, with_scales=zooms
     )
     return found, replace(view, curvature=curvature)

@@ -27,11 +27,6 @@ MIN_GAIN = 0.01
 as much."""
 
 
-LEARNED_POINTS = 300
-"""Number of points from which perspective is learned. Hidden entries were completed without perspective, and tracks on an outline follow
-it instead of the surface until they are lost. Error on a filmed head: .071 with the half of 600 points that is seen most, .119 with all."""
-
-
 def settled(
     estimate: CameraEstimate,
     normalized: Normalized,
@@ -61,12 +56,11 @@ def settled(
     assert estimate.perspective is not None
     shift = estimate.perspective.offsets + estimate.translations
     view = replace(
-        estimate.perspective, filling=estimate.filling, sample=estimate.sample + shift[:, None],
-        often_seen=_often_seen(normalized.visible[:, estimate.sampled]),
+        estimate.perspective, filling=estimate.filling, sample=estimate.sample + shift[:, None]
     )  # fmt: skip
     rotations, scales = np.asarray(estimate.rotations), np.asarray(estimate.scales)
     view, found = search(
-        view.views[used], rotations[used], scales[used], view,
+        view.sample[used], rotations[used], scales[used], view,
         model_order=model_order, turning=turning, should_stop=should_stop,
     )  # fmt: skip
     if not view.bends:
@@ -81,12 +75,6 @@ def settled(
     if not turning or is_planar(settled_estimate.gram):
         return settled_estimate
     return _restarted(settled_estimate, normalized, used, found, model_order=model_order, should_stop=should_stop)
-
-
-def _often_seen(visible: Floats) -> NDArray[np.bool_]:
-    """Return the `LEARNED_POINTS` points that are seen most, or more where several are seen alike, shape `(S,)`."""
-    seen = visible.sum(axis=0)
-    return np.asarray(seen >= np.sort(seen)[-LEARNED_POINTS:][0])
 
 
 def _restarted(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -12,7 +12,6 @@ from pliant.solver.model.marginal_likelihood import UNLIKELY
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.so3 import angles_between, exponential, logarithm, nearest
 from pliant.solver.records import Floats
-from pliant.solver.refinement import depth_rounds
 from pliant.solver.refinement.focal_length import _Comparison, search
 from pliant.solver.refinement.learned import Learned, stretched
 from pliant.solver.tracks.frame_selection import evenly_spread
@@ -88,21 +87,6 @@ def test_a_focal_length_at_which_the_depths_diverge_is_unlikely() -> None:
     comparison = _Comparison.of(face.views, face.rotations, np.ones(8), ModelOrder(), turning=True)
     comparison.add(30.0)
     assert comparison.trials[30.0].nll == UNLIKELY
-
-
-def test_perspective_is_learned_from_the_points_that_are_seen_most(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(depth_rounds, "LEARNED_POINTS", 3)
-    visible = np.ones((10, 6))
-    visible[3:, 0] = visible[9:, 1] = 0
-    visible[:, 2] = 0.5
-    often = depth_rounds._often_seen(visible)
-    assert often.tolist() == [False, False, False, True, True, True]
-    sample = np.arange(120.0).reshape(10, 6, 2)
-    view = replace(view_of(10), sample=sample)
-    assert view.views is sample
-    assert np.array_equal(replace(view, often_seen=often).views, sample[:, 3:])
-    assert depth_rounds._often_seen(np.ones((10, 6))).all()
-    assert depth_rounds._often_seen(np.ones((10, 2))).all()
 
 
 def test_cameras_of_some_frames_are_extended_to_all() -> None:
