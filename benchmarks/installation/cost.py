@@ -1,4 +1,8 @@
-"""Compare memory and processor time of whole jobs with their estimates: `python -m benchmarks.installation.cost`."""
+"""Compare memory and processor time of whole jobs with their estimates: `python -m benchmarks.installation.cost [--near]`.
+
+With `--near`, the time of the solver alone where perspective is found, relative to the same face far away: with noise, and with 20 % hidden
+observations on top.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +16,14 @@ from pathlib import Path
 
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
-from pliant.solver import gallery, threads_limited
+from pliant.solver import Settings, gallery, solve, threads_limited
 from pliant.worker.execution.pipeline import reconstruct
 from pliant.worker.formats import Inputs
 from pliant.worker.formats.cost import estimated
+
+from benchmarks.accuracy.distances import PICTURE, seen_from
+from benchmarks.accuracy.spoiling import Spoiling, spoiled
+from benchmarks.sequences import Case, from_gallery
 
 SIZES = (
     (10, 500),
@@ -29,6 +37,9 @@ SIZES = (
     (200, 500),
 )
 """Frames and points."""
+
+NEAR_SIZES, DISTANCE, NOISE = ((50, 500), (100, 300)), 5.0, 0.5
+"""Frames and points; distance of the camera in half-sizes; standard deviation of the noise, px."""
 
 
 def measure(frames: int, points: int) -> None:
@@ -46,6 +57,23 @@ def measure(frames: int, points: int) -> None:
     print(json.dumps({"points": count, "peak": peak, "seconds": time.process_time() - began}))
 
 
+def near() -> None:
+    """Print the times of near faces relative to the same far face."""
+    for frames, points in NEAR_SIZES:
+        case = from_gallery(gallery.face(frames, points, degrees=40), "face")
+        far = _seconds(case, float("inf"), Spoiling(noise=NOISE), None)
+        noisy = _seconds(case, DISTANCE, Spoiling(noise=NOISE), PICTURE)
+        hidden = _seconds(case, DISTANCE, Spoiling(noise=NOISE, hidden=0.2), PICTURE)
+        print(f"{frames:>6} × {points:<8,} {noisy / far:>6.1f} {hidden / far:>6.1f}", flush=True)
+
+
+def _seconds(case: Case, distance: float, spoiling: Spoiling, picture: tuple[float, float] | None) -> float:
+    tracks = spoiled(seen_from(case, distance)[0], spoiling)
+    began = time.process_time()
+    solve(tracks, case.mesh, settings=Settings(image_size=picture))
+    return time.process_time() - began
+
+
 def main() -> None:
     """Measure every size in a separate process."""
     print(f"{'frames × points':>17} {'peak, MB':>9} {'estimate':>9} {'seconds':>9} {'estimate':>9}")
@@ -61,7 +89,9 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 1:
+    if sys.argv[1:] == ["--near"]:
+        near()
+    elif len(sys.argv) > 1:
         measure(int(sys.argv[1]), int(sys.argv[2]))
     else:
         main()

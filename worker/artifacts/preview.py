@@ -231,7 +231,9 @@ def triangles(mesh: Mesh | None) -> NDArray[np.uint32]:
 
 
 def _onto(shapes: Floats, truth: Floats) -> tuple[Floats | None, bool]:
-    """Return the truth aligned with the result per frame, and whether the result's depth has the opposite sign.
+    """Return the truth aligned with the result per frame and in its size, and whether the result's depth has the opposite sign.
+
+    None if too few points have a truth, or if the result has no extent.
 
     Points without truth are excluded from the alignment and take the position of the result.
     """
@@ -239,9 +241,12 @@ def _onto(shapes: Floats, truth: Floats) -> tuple[Floats | None, bool]:
     if known.sum() < LEAST_TRUE:
         return None, False
     aligned = align(shapes[:, known], truth[:, known], kind="frame_scaled")
+    scale = float(aligned.scales.mean())
+    if scale == 0:  # the result is one point
+        return None, False
     turned = shapes.copy()
     # aligned.shapes = k (S − centre) Tᵀ ≈ G, so G T / k + centre ≈ S.
-    centre, scale = shapes[:, known].mean(axis=1, keepdims=True), aligned.scales.mean()
+    centre = shapes[:, known].mean(axis=1, keepdims=True)
     turned[:, known] = aligned.truth @ aligned.transforms / scale + centre
     return turned, bool(np.linalg.det(aligned.transforms[0]) < 0)
 

@@ -135,6 +135,14 @@ def test_truth_is_aligned_and_scaled_to_the_result(
     assert (apart[:, 7] == 0).all()
 
 
+def test_a_result_without_extent_shows_no_truth(sequence: Sequence, tmp_path: Path) -> None:
+    solution = replace(solution_of(sequence), shapes=np.zeros_like(sequence.shapes))
+    path = tmp_path / preview.NAME
+    write(path, tracks=sequence.tracks, mesh=None, solution=solution, truth=sequence.shapes)
+    _, arrays = read(path)
+    assert "truth" not in arrays
+
+
 def test_tables_hold_visibility_rejections_and_uncertainty(sequence: Sequence, tmp_path: Path) -> None:
     exact = solution_of(sequence)
     seen = sequence.tracks.visible > 0

@@ -92,8 +92,8 @@ def test_the_time_estimate_is_within_a_factor_of_two_of_measurements(
     assert seconds / 2 < estimate.seconds < 2 * seconds
 
 
-@pytest.mark.parametrize("measured", [1.3, 1.9, 2.7, 3.5])
-def test_the_time_with_perspective_is_within_a_factor_of_two_of_measurements(measured: float) -> None:
+@pytest.mark.parametrize("measured", [1.1, 2.7, 2.8, 3.4, 3.5])
+def test_the_time_with_a_known_lens_is_within_a_factor_of_two_of_measurements(measured: float) -> None:
     plain = estimated(50, 500, Options())
     near = estimated(50, 500, Options(image_size="640x480"))
     assert measured / 2 < near.seconds / plain.seconds < 2 * measured
