@@ -10,7 +10,7 @@ import numpy as np
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.chaining import DELTAS, FIRST_STEPS, FLOW_MARGIN
 from pliant.tracking.decoding.film import Film
-from pliant.tracking.flow import Grey, dense_flow, opencv_serial
+from pliant.tracking.flow import Bools, Grey, dense_flow, opencv_serial
 from pliant.tracking.region import Region, read_region
 from pliant.tracking.registration import STEPS, Registration
 from pliant.tracking.seeding import Seeds, default_step, neighbours, place
@@ -54,7 +54,7 @@ def estimate(
     if len(seeds.points) == 0:
         return Estimate(0, 0.0)
     with opencv_serial():
-        seconds = FLOWS * _flow_seconds(grey, mask) + _rounds_seconds(grey, seeds)
+        seconds = FLOWS * _flow_seconds(grey, mask) + _rounds_seconds(grey, mask, seeds)
     return Estimate(len(seeds.points), count * seconds / max(threads, 1))
 
 
@@ -72,7 +72,7 @@ def _frame(film: Film, index: int, longest_side: int) -> tuple[Grey, float]:
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8), scale
 
 
-def _flow_seconds(grey: Grey, mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> float:
+def _flow_seconds(grey: Grey, mask: Bools) -> float:
     """Time the flow inside the region's box between the frame and the frame moved by a pixel."""
     row, column = np.nonzero(mask)
     box = np.s_[row.min() : row.max() + 1, column.min() : column.max() + 1]
@@ -84,9 +84,9 @@ def _flow_seconds(grey: Grey, mask: np.ndarray[tuple[int, ...], np.dtype[np.bool
     return time.perf_counter() - began
 
 
-def _rounds_seconds(grey: Grey, seeds: Seeds) -> float:
+def _rounds_seconds(grey: Grey, mask: Bools, seeds: Seeds) -> float:
     """Time the work of both rounds per frame besides flow: register and compare the frame with itself, half a pixel off."""
-    appearance = Appearance.of(grey, seeds.points, neighbours(seeds.grid, len(seeds.points)))
+    appearance = Appearance.of(grey, mask, seeds.points, neighbours(seeds.grid, len(seeds.points)))
     registration = Registration.of(grey, seeds.points, seeds.grid, noise=appearance.noise)
     beside, visible = seeds.points + np.float32(0.5), np.ones(len(seeds.points), dtype=bool)
     began = time.perf_counter()

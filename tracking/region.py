@@ -66,6 +66,7 @@ def read_region(region: Region, size: tuple[int, int]) -> Bools:
 
 def transport(
     read: Callable[[int], Grey],
+    region: Bools,
     seeds: Seeds,
     start: int,
     end: int,
@@ -74,14 +75,14 @@ def transport(
     on_step: OnStep,
     should_stop: Callable[[], bool],
 ) -> Bools:
-    """Carry a region from one frame to another and return its mask there.
+    """Carry a region `(H, W)` from one frame to another and return its mask there.
 
     The grid's points are carried directly from the start and, in steps, from frame to frame; the more certain result is taken, as in
     `chaining`. The mask is the union of the faces whose corners are all visible, closed over one grid step.
     """
     points, seen = seeds.points, np.ones(len(seeds.points), dtype=bool)
     variance = np.zeros(len(points), dtype=np.float32)
-    appearance = Appearance.of(read(start), seeds.points, neighbours(seeds.grid, len(points)))
+    appearance = Appearance.of(read(start), region, seeds.points, neighbours(seeds.grid, len(points)))
     direction = 1 if end > start else -1
     stations = [*range(start, end, direction * LONG_STEP), end]
     for before, here in itertools.pairwise(stations):

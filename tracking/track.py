@@ -174,7 +174,7 @@ def _carry(run: _Run, mask: Bools, origin: int, template: int) -> Bools:
             hint="Draw a larger region, or draw it in the template frame itself (region_frame).",
         )  # fmt: skip
     carried = transport(
-        run.store.read, seeds, origin, template, pool=run.pool, on_step=run.on_step, should_stop=run.should_stop
+        run.store.read, mask, seeds, origin, template, pool=run.pool, on_step=run.on_step, should_stop=run.should_stop
     )
     if carried.sum() < 0.1 * mask.sum():
         raise FilmError(
@@ -197,7 +197,7 @@ def _track(run: _Run, found: Survey, plan: _Plan, step: float | None, *, whole: 
         )  # fmt: skip
     notes = warnings_before(run.film, found, plan.start, plan.stop, whole=whole, rough=rough)
     run.on_warnings(notes)
-    appearance = Appearance.of(template, seeds.points, neighbours(seeds.grid, len(seeds.points)))
+    appearance = Appearance.of(template, plan.mask, seeds.points, neighbours(seeds.grid, len(seeds.points)))
     registration = Registration.of(template, seeds.points, seeds.grid, noise=appearance.noise)
     length = plan.stop - plan.start
     done = 1

@@ -41,7 +41,7 @@ def followed(speed: float, *, template: int = 0, hidden: range = range(0)) -> tu
     start = 32 + round(speed * template)
     region[40:264, start + 8 : start + 232] = True
     seeds, _ = place(frames[template], region, step=8)
-    appearance = Appearance.of(frames[template], seeds.points, neighbours(seeds.grid, len(seeds.points)))
+    appearance = Appearance.of(frames[template], region, seeds.points, neighbours(seeds.grid, len(seeds.points)))
     registration = Registration.of(frames[template], seeds.points, seeds.grid, noise=appearance.noise)
     order: list[int] = []
     with ThreadPoolExecutor(2) as pool:

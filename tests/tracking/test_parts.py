@@ -171,7 +171,7 @@ def test_patches_detect_occlusion() -> None:
     first, second = grey()
     seeds, _ = place(first, np.ones_like(first, bool), step=6)
     beside = neighbours(seeds.grid, len(seeds.points))
-    appearance = Appearance.of(first, seeds.points, beside)
+    appearance = Appearance.of(first, np.ones_like(first, bool), seeds.points, beside)
     moved = seeds.points + np.float32([2, 0])
     everything = np.ones(len(moved), bool)
     inner = ((moved > 12) & (moved < (84, 60))).all(axis=1)
@@ -181,6 +181,48 @@ def test_patches_detect_occlusion() -> None:
     seen = appearance.agrees(hidden, moved, everything)
     assert seen[inner & (moved[:, 0] > 48)].all()
     assert not seen[inner & (moved[:, 0] < 34)].any()
+
+
+def test_what_surrounds_the_region_does_not_count() -> None:
+    """A disc moves before a background that changes; half of the patches at its outline show the background."""
+    first, second = grey()
+    disc = np.hypot(*(np.mgrid[:72, :96] - np.array([36, 46])[:, None, None])) < 26
+    noise = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(72, 192)), (0, 0), 2.0)
+    behind = np.clip(128 + 60 * noise / noise.std(), 0, 255).astype(np.uint8)
+    first, second = np.where(disc, first, behind[:, :96]), np.where(np.roll(disc, 2, axis=1), second, behind[:, 96:])
+    seeds, _ = place(first, disc, step=4)
+    moved, beside = seeds.points + np.float32([2, 0]), neighbours(seeds.grid, len(seeds.points))
+    everything = np.ones(len(moved), bool)
+    masked, whole = (
+        Appearance.of(first, region, seeds.points, beside).agrees(second, moved, everything)
+        for region in (disc, np.ones_like(disc))
+    )
+    assert masked.mean() > 0.97
+    assert whole.mean() < 0.8
+    slid = moved.copy()
+    slid[:, 0] += 4  # as if they followed something else
+    assert Appearance.of(first, disc, seeds.points, beside).agrees(second, slid, everything).mean() < 0.1
+
+
+def test_hidden_neighbours_hide_a_point_sooner_at_the_edge_of_the_grid() -> None:
+    first, second = grey()
+    seeds, _ = place(first, np.ones_like(first, bool), step=8)
+    beside = neighbours(seeds.grid, len(seeds.points))
+    appearance = Appearance.of(first, np.ones_like(first, bool), seeds.points, beside)
+    rows, columns = seeds.grid.shape
+    row, column = rows // 2, columns // 2
+
+    def seen(*hidden: tuple[int, int]) -> np.ndarray:
+        visible = np.ones(len(seeds.points), bool)
+        for cell in hidden:
+            visible[seeds.grid[cell]] = False
+        return appearance.agrees(second, seeds.points + np.float32([2, 0]), visible)
+
+    assert seen()[seeds.grid[row, column]]
+    assert seen((row, column - 1))[seeds.grid[row, column]]
+    assert not seen((row, column - 1), (row, column + 1))[seeds.grid[row, column]]
+    assert seen()[seeds.grid[1, 0]]
+    assert not seen((2, 0))[seeds.grid[1, 0]]
 
 
 def test_noise_is_estimated_on_texture() -> None:

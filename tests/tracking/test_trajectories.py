@@ -75,7 +75,7 @@ def film() -> tuple[np.ndarray, np.ndarray, Appearance, Registration]:
     region[20:100, 20:120] = True
     seeds, _ = place(grey[0], region, step=5)
     drift = np.stack([0.8 * np.arange(FRAMES), np.zeros(FRAMES)], axis=1).astype(np.float32)
-    appearance = Appearance.of(grey[0], seeds.points, neighbours(seeds.grid, len(seeds.points)))
+    appearance = Appearance.of(grey[0], region, seeds.points, neighbours(seeds.grid, len(seeds.points)))
     registration = Registration.of(grey[0], seeds.points, seeds.grid, noise=noise_variance(grey[0]))
     return grey, seeds.points + drift[:, None], appearance, registration
 
