@@ -14,6 +14,8 @@ for a smooth one. Below the floors, smoother motion is no longer rewarded.
 
 from __future__ import annotations
 
+from math import log
+
 import numpy as np
 from pliant.solver.records import Floats
 
@@ -23,31 +25,31 @@ TURN_FLOOR = np.radians(0.2)
 SCALE_FLOOR = 0.002
 """Floor of the change of log s between frames: smaller changes are not rewarded."""
 
-STEADY = 0.5 * float(np.log(SCALE_FLOOR**2))
+STEADY = 0.5 * log(SCALE_FLOOR**2)
 """Penalty on equal scales, added if scales are fixed so that energies with fixed and free scales are comparable."""
 
 
 def rotation_roughness(rotations: Floats) -> tuple[float, Floats]:
     """Return the penalty on rotations of shape `(F, 3, 3)` and its gradient with respect to all nine entries of each."""
-    turns = rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2)
+    turns = rotations[1:] @ rotations[:-1].transpose(0, 2, 1)
     changes = turns[1:] - turns[:-1]
     count = max(len(changes), 1)
-    variance = TURN_FLOOR**2 + 0.5 * float((changes**2).sum()) / count
-    by_turns = np.zeros_like(turns)
-    by_turns[1:] += changes
+    variance = TURN_FLOOR**2 + 0.5 * float(np.vdot(changes, changes)) / count
+    by_turns = np.zeros(turns.shape)
+    by_turns[1:] = changes
     by_turns[:-1] -= changes
     by_turns *= 1.5 / (variance * len(rotations))
-    gradient = np.zeros_like(rotations)
-    gradient[1:] += by_turns @ rotations[:-1]
-    gradient[:-1] += np.swapaxes(by_turns, 1, 2) @ rotations[1:]
-    return 1.5 * count / len(rotations) * float(np.log(variance)), gradient
+    gradient = np.zeros(rotations.shape)
+    gradient[1:] = by_turns @ rotations[:-1]
+    gradient[:-1] += by_turns.transpose(0, 2, 1) @ rotations[1:]
+    return 1.5 * count / len(rotations) * log(variance), gradient
 
 
 def scale_roughness(logs: Floats) -> tuple[float, Floats]:
     """Return the penalty on the logarithms of the scales, shape `(F,)`, and its gradient."""
     steps = logs[1:] - logs[:-1]
-    variance = SCALE_FLOOR**2 + float((steps**2).mean())
-    gradient = np.zeros_like(logs)
-    gradient[1:] += steps
+    variance = SCALE_FLOOR**2 + float(np.vdot(steps, steps)) / len(steps)
+    gradient = np.zeros(logs.shape)
+    gradient[1:] = steps
     gradient[:-1] -= steps
-    return 0.5 * float(np.log(variance)), gradient / (variance * len(steps))
+    return 0.5 * log(variance), gradient / (variance * len(steps))

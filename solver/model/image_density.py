@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from math import inf, isfinite
 
 import numpy as np
 from pliant.solver.model.random_walk import WalkPosterior, random_walk
@@ -63,7 +64,7 @@ class ImageModel:
         rows = self.walk.reshape(-1, 3)
         image: Floats = self.columns @ self.columns.T
         image += (rows @ rows.T) * (self.walk_variance * _wide_walk(len(self.walk), self.ordered))
-        image.flat[:: len(rows) + 1] += self.noise_variance
+        image.ravel()[:: len(rows) + 1] += self.noise_variance
         return image
 
 
@@ -107,23 +108,22 @@ def terms(model: ImageModel, factor: Floats) -> Terms:
     rows, count = model.columns.shape
     dense = rows <= DENSE_ROWS or count + factor.shape[1] > DENSE_SHARE * rows
     found = dense_terms(model, factor) if dense else woodbury_terms(model, factor)
-    if not np.isfinite(found.value):
+    if not isfinite(found.value):
         raise np.linalg.LinAlgError("the density of the images is not finite")
     return found
 
 
 def dense_terms(model: ImageModel, factor: Floats) -> Terms:
     """Return E and its derivatives by a Cholesky factor of V."""
-    frames = len(model.walk)
+    frames, rows = len(model.walk), model.walk.reshape(-1, 3)
     inverse, log_det = inverted(model.covariance())
     explained = inverse @ factor
-    value = 0.5 * (log_det + float(np.einsum("ij,ij->", explained, factor))) / frames
-    slope = (inverse - explained @ explained.T) * (0.5 / frames)
-    walked = slope * (model.walk_variance * _wide_walk(frames, model.ordered))
-    by_walk = 2 * (walked @ model.walk.reshape(-1, 3)).reshape(frames, 2, 3)
+    slope = inverse - explained @ explained.T
+    slope /= frames  # 2Δ
+    by_walk = model.walk_variance * ((slope * _wide_walk(frames, model.ordered)) @ rows)
     return Terms(
-        value, 2 * slope @ model.columns, by_walk, float(np.trace(slope)),
-        0.5 * float((by_walk * model.walk).sum()) / model.walk_variance,
+        0.5 * (log_det + float(np.vdot(explained, factor))) / frames, slope @ model.columns,
+        by_walk.reshape(frames, 2, 3), 0.5 * float(slope.trace()), 0.5 * float(np.vdot(by_walk, rows)) / model.walk_variance,
     )  # fmt: skip
 
 
@@ -234,11 +234,11 @@ def inverted(matrix: Floats) -> tuple[Floats, float]:
         It is indefinite to rounding, or not finite.
     """
     factor, failed = lapack.dpotrf(matrix, lower=1)
-    log_det = np.inf if failed else 2 * float(np.log(np.diag(factor)).sum())
-    if not np.isfinite(log_det):
+    log_det = inf if failed else 2 * float(np.log(factor.diagonal()).sum())
+    if not isfinite(log_det):
         raise np.linalg.LinAlgError("the covariance of the images is not positive definite")
     inverse = np.asarray(lapack.dpotri(factor, lower=1, overwrite_c=1)[0])
-    inverse.flat[:: len(inverse) + 1] /= 2  # above the diagonal, the factor has zeros
+    inverse.ravel("K")[:: len(inverse) + 1] *= 0.5  # above the diagonal, the factor has zeros
     return inverse + inverse.T, log_det
 
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 from pliant.solver.records import Floats
 
-SMALL_ANGLE = 1e-4
-"""Angle, rad, below which the closed forms suffer cancellation; their Taylor series to second order is exact to 1e-17."""
+HAT = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0.0]])
+"""[v]× of the unit vectors v, in rows: a product with them takes a third of the time of indexing, which matters for short films."""
+
+IDENTITY = np.eye(3)
+TINY = float(np.finfo(np.float64).tiny)
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
 """The depth mirror D: (S, R) and (S·D, D·R·D) have the same orthographic image."""
@@ -14,34 +17,17 @@ MIRROR = np.diag([1.0, 1.0, -1.0])
 
 def hat(vectors: Floats) -> Floats:
     """Return the skew matrices [v]×, so that [v]× u = v × u; shapes `(..., 3)` to `(..., 3, 3)`."""
-    matrices = np.zeros((*vectors.shape, 3))
-    matrices[..., 0, 1], matrices[..., 0, 2], matrices[..., 1, 2] = -vectors[..., 2], vectors[..., 1], -vectors[..., 0]
-    return matrices - np.swapaxes(matrices, -1, -2)
+    return np.asarray((vectors @ HAT).reshape(*vectors.shape, 3))
 
 
 def vee(matrices: Floats) -> Floats:
     """Return u with ⟨X, [v]×⟩ = uᵀv for every v: the gradient with respect to v of a function whose gradient is X."""
-    flipped = matrices - np.swapaxes(matrices, -1, -2)
-    return flipped[..., [2, 0, 1], [1, 2, 0]]
-
-
-def _coefficients(vectors: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³ of the angles, shape `(..., 1, 1)` each."""
-    angle = np.sqrt((vectors * vectors).sum(axis=-1))[..., None, None]
-    small = angle < SMALL_ANGLE
-    safe = np.where(small, 1.0, angle)
-    square = angle**2
-    first = np.where(small, 1 - square / 6, np.sin(safe) / safe)
-    second = np.where(small, 0.5 - square / 24, (1 - np.cos(safe)) / safe**2)
-    third = np.where(small, 1 / 6 - square / 120, (safe - np.sin(safe)) / safe**3)
-    return first, second, third
+    return np.asarray(matrices.reshape(*matrices.shape[:-2], 9) @ HAT.T)
 
 
 def exponential(vectors: Floats) -> Floats:
     """Return the rotations by angle ‖v‖ about v (Rodrigues), shapes `(..., 3)` to `(..., 3, 3)`."""
-    first, second, _ = _coefficients(vectors)
-    skew = hat(vectors)
-    return np.eye(3) + first * skew + second * (skew @ skew)
+    return exponential_and_jacobian(vectors)[0]
 
 
 def logarithm(rotations: Floats) -> Floats:
@@ -49,7 +35,7 @@ def logarithm(rotations: Floats) -> Floats:
     sine = 0.5 * vee(rotations)
     length = np.linalg.norm(sine, axis=-1)
     angle = np.arctan2(length, 0.5 * (np.trace(rotations, axis1=-2, axis2=-1) - 1.0))
-    axis = sine / np.maximum(length, np.finfo(float).tiny)[..., None]
+    axis = sine / np.maximum(length, TINY)[..., None]
     # near half a turn the sine vanishes: the axis is the leading eigenvector of R + Rᵀ, with the sign of the sine vector
     opposite = angle > np.pi - 1e-3
     if np.any(opposite):
@@ -60,11 +46,17 @@ def logarithm(rotations: Floats) -> Floats:
 
 
 def exponential_and_jacobian(vectors: Floats) -> tuple[Floats, Floats]:
-    """Return exp(v) and its left Jacobian J, exp(v + dv) = exp(J dv) exp(v) to first order, shapes `(..., 3, 3)`."""
-    first, second, third = _coefficients(vectors)
-    skew, identity = hat(vectors), np.eye(3)
-    square = skew @ skew
-    return identity + first * skew + second * square, identity + second * skew + third * square
+    """Return exp(v) and its left Jacobian J, exp(v + dv) = exp(J dv) exp(v) to first order, shapes `(..., 3, 3)`.
+
+    J = I + (1 − cos θ)/θ² [v]× + (θ − sin θ)/θ³ [v]×², by half angles so that small ones do not cancel, and exp(v) = I + [v]× J.
+    """
+    square = np.maximum((vectors * vectors).sum(axis=-1), TINY)[..., None, None]
+    half = 0.5 * np.sqrt(square)
+    sinc = np.sin(half) / half
+    skew = hat(vectors)
+    # For small angles the last factor has an error of rounding/θ², and multiplies [v]×², of size θ².
+    jacobian = IDENTITY + (0.5 * sinc * sinc) * skew + ((1 - sinc * np.cos(half)) / square) * (skew @ skew)
+    return IDENTITY + skew @ jacobian, jacobian
 
 
 def from_rows(rows: Floats) -> Floats:
