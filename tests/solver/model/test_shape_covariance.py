@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from learning import learn
 from pliant.solver import KnownCamera, Settings, gallery, solve
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.evaluation import metrics
+from pliant.solver.model import expectation_maximisation
 from pliant.solver.model.expectation_maximisation import (
     MAX_DENSE_FRAMES,
     MAX_ITERATIONS,
@@ -214,3 +216,19 @@ def test_a_long_rigid_film_without_modes_is_learned() -> None:
         found = improve(rigid, gram, projections, iterations=2, max_modes=max_modes)
         assert found.modes.shape == (frames, 0)
         assert np.isfinite(found.nll)
+
+
+def test_eigenvalues_that_do_not_converge_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    failing = SimpleNamespace(dsyevd=lambda matrix, lower: (np.ones(len(matrix)), matrix, 1))
+    monkeypatch.setattr(expectation_maximisation, "lapack", failing)
+    with pytest.raises(np.linalg.LinAlgError, match="did not converge"):
+        expectation_maximisation._split(np.eye(5), 1e-6, 3, ordered=True)
+
+
+@pytest.mark.parametrize("ordered", [True, False])
+def test_modes_and_walk_reproduce_a_covariance_of_their_form(ordered: bool) -> None:
+    modes, walk_variance = np.linalg.qr(np.random.default_rng(0).normal(size=(12, 3)))[0] * [3.0, 2.0, 1.0], 1e-3
+    over_frames = modes @ modes.T + walk_variance * random_walk(12, ordered)
+    found, variance = expectation_maximisation._split(over_frames, 1e-9, 8, ordered=ordered)
+    assert found.shape == (12, 3)
+    np.testing.assert_allclose(found @ found.T + variance * random_walk(12, ordered), over_frames, atol=1e-12)
