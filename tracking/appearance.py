@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pliant.tracking.flow import Bools, Floats, Grey
+from pliant.tracking.flow import Bools, Floats, Grey, sample
 
 LEAST_CORRELATION = 0.6
 """Correlation below which a point is hidden: two thirds of the patch's variance (1 − .6²) are then unexplained, which closed flow cycles do
@@ -52,8 +52,8 @@ class Appearance:
     def of(cls, template: Grey, region: Bools, points: Floats, neighbours: NDArray[np.int64]) -> Appearance:
         """Cut the patches out of the region `(H, W)` of a template."""
         image, places = smooth(template), points[:, None] + PATCH_OFFSETS
-        inside = (cut(region.astype(np.float32), places) > 0.5).astype(np.float32)
-        return cls(points, neighbours, inside, _centred(cut(image, places), inside), noise_variance(template))
+        inside = (sample(region.astype(np.float32), places) > 0.5).astype(np.float32)
+        return cls(points, neighbours, inside, _centred(sample(image, places), inside), noise_variance(template))
 
     def agrees(self, frame: Grey, points: Floats, visible: Bools, *, pool: ThreadPoolExecutor | None = None) -> Bools:
         """Compare a frame with the template at tracked points `(P, 2)`; return which visible points stay visible, shape `(P,)`.
@@ -66,14 +66,14 @@ class Appearance:
             lambda block: self._correlates(image, points[block], affine[block], block), len(points), pool
         )
         beside = self.neighbours >= 0
-        lost = (beside & ~seen[self.neighbours]).sum(axis=1)
+        lost = np.count_nonzero(beside & ~seen[self.neighbours], axis=1)
         return np.asarray(seen & (lost < np.where(beside.all(axis=1), LOST_NEIGHBOURS, LOST_NEIGHBOURS - 1)))
 
     def _correlates(self, image: Floats, points: Floats, affine: Floats, block: slice) -> Bools:
         """Return which points of one block have patches like the template's."""
         template, inside = self.patches[block], self.inside[block]
         floor = inside.sum(axis=1) * np.float32(self.noise + 1.0)
-        patches = _centred(cut(image, points[:, None] + _offsets(affine)), inside)
+        patches = _centred(sample(image, points[:, None] + _offsets(affine)), inside)
         norms = (_dot(patches, patches) + floor) * (_dot(template, template) + floor)
         return np.asarray(_dot(patches, template) + floor >= LEAST_CORRELATION * np.sqrt(norms))
 
@@ -81,14 +81,13 @@ class Appearance:
         """Estimate local affine maps from the differences to grid neighbours, shape `(P, 2, 2)`; identity where unknown."""
         affine = np.tile(np.eye(2, dtype=np.float32), (len(points), 1, 1))
         for axis in (0, 1):
-            pair = self.neighbours[:, 2 * axis : 2 * axis + 2]
-            usable = (pair >= 0) & visible[pair] & visible[:, None]
-            sign = np.array([-1.0, 1.0], dtype=np.float32)
-            there = (points[pair] - points[:, None]) * sign[:, None]
-            here = (self.points[pair] - self.points[:, None])[..., axis] * sign
-            total = np.where(usable, here, 0).sum(axis=1)
-            column = np.where(usable[..., None], there, 0).sum(axis=1) / np.maximum(total, 1e-6)[:, None]
-            plausible = (total > 0) & ((column**2).sum(axis=1) < 4)
+            there, total = np.zeros_like(points), np.zeros_like(points[:, 0])
+            for neighbour, sign in zip(self.neighbours[:, 2 * axis : 2 * axis + 2].T, (-1, 1), strict=True):
+                usable = sign * ((neighbour >= 0) & visible[neighbour] & visible).astype(np.float32)
+                there += usable[:, None] * (points[neighbour] - points)
+                total += usable * (self.points[neighbour, axis] - self.points[:, axis])
+            column = np.asarray(there / np.maximum(total, 1e-6)[:, None], dtype=np.float32)
+            plausible = (total > 0) & (_dot(column, column) < 4)
             affine[plausible, :, axis] = column[plausible]
         return affine
 
@@ -123,14 +122,3 @@ def _dot(first: Floats, second: Floats) -> Floats:
 def _centred(patches: Floats, inside: Floats) -> Floats:
     mean = _dot(patches, inside) / np.maximum(inside.sum(axis=1), 1)
     return np.asarray((patches - mean[:, None]) * inside)
-
-
-def cut(image: Floats, places: Floats) -> Floats:
-    """Interpolate an image `(H, W)` or `(H, W, C)` at positions `(P, K, 2)`, rounded to 1/32 pixel; the border repeats."""
-    x, y = (np.ascontiguousarray(places[..., axis], dtype=np.float32) for axis in (0, 1))
-    # OpenCV stores the sizes of maps in 16 bits, so many points are split into blocks.
-    blocks = [
-        cv2.remap(image, x[part], y[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        for part in (slice(start, start + 30_000) for start in range(0, len(x), 30_000))
-    ]
-    return np.concatenate(blocks).astype(np.float32)

@@ -21,6 +21,13 @@ CYCLE_RATIO, CYCLE_FLOOR = 0.01, 0.5
 EDGE_RATIO, EDGE_FLOOR = 0.01, 0.002
 """A motion boundary is where |∇u|² + |∇v|² > ratio · |w|² + floor (Sundaram et al., equation 6)."""
 
+STRIDE, DESCENTS, SMOOTHINGS = 4, 8, 3
+"""Distance of the patches in pixels, steps of their search, and of the smoothing after it, at every scale, if a similar flow is known.
+OpenCV's 3, 25 and 5 take 1.9 times as long and, on rendered films and a real face, keep at most .01 more of the observations."""
+
+MOST_ROWS = 30_000
+"""Rows of positions that OpenCV reads at once; it stores the sizes of such maps in 16 bits."""
+
 _SERIAL = threading.Lock()
 _serial_users = 0
 _threads_before = 0
@@ -66,17 +73,25 @@ def opencv_serial() -> Iterator[None]:
                 cv2.setNumThreads(_threads_before)
 
 
-def dense_flow(first: Grey, second: Grey) -> Floats:
-    """Compute the flow from one frame to another by dense inverse search (Kroeger et al. 2016), shape `(H, W, 2)`, pixels."""
+def dense_flow(first: Grey, second: Grey, similar: Floats | None = None) -> Floats:
+    """Compute the flow from one frame to another by dense inverse search (Kroeger et al. 2016), shape `(H, W, 2)`, pixels.
+
+    The search starts from a `similar` flow of the same shape, if there is one, and is then shorter.
+    """
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    return np.asarray(search.calc(first, second, None), dtype=np.float32)  # type: ignore[call-overload]
+    if similar is None:
+        return np.asarray(search.calc(first, second, None), dtype=np.float32)  # type: ignore[call-overload]
+    search.setPatchStride(STRIDE)
+    search.setGradientDescentIterations(DESCENTS)
+    search.setVariationalRefinementIterations(SMOOTHINGS)
+    return np.asarray(search.calc(first, second, similar.copy()), dtype=np.float32)
 
 
 def match(forward: Floats, backward: Floats, points: Floats) -> Match:
     """Carry points `(P, 2)` along the forward flow `(H, W, 2)`, and check them with the backward flow."""
-    step = sample(forward, points)
+    step = sample(forward, points[:, None])[:, 0]
     landed = points + step
-    back = sample(backward, landed)
+    back = sample(backward, landed[:, None])[:, 0]
     gap = ((step + back) ** 2).sum(axis=1)
     lengths = (step**2).sum(axis=1) + (back**2).sum(axis=1)
     height, width = forward.shape[:2]
@@ -86,26 +101,21 @@ def match(forward: Floats, backward: Floats, points: Floats) -> Match:
     )
 
 
-def sample(field: Floats, points: Floats) -> Floats:
-    """Interpolate a field `(H, W, C)` bilinearly at points `(P, 2)`; outside, the border value is repeated."""
-    height, width = field.shape[:2]
-    x = np.clip(points[:, 0], 0, width - 1)
-    y = np.clip(points[:, 1], 0, height - 1)
-    column = np.minimum(x.astype(np.int32), width - 2)
-    row = np.minimum(y.astype(np.int32), height - 2)
-    right = (x - column)[:, None]
-    down = (y - row)[:, None]
-    flat = field.reshape(height * width, -1)
-    corner = row * width + column
-    above = flat[corner] * (1 - right) + flat[corner + 1] * right
-    below = flat[corner + width] * (1 - right) + flat[corner + width + 1] * right
-    return np.asarray(above * (1 - down) + below * down, dtype=np.float32)
+def sample(image: Floats, places: Floats) -> Floats:
+    """Interpolate an image `(H, W)` or `(H, W, C)` at positions `(N, K, 2)`, rounded to 1/32 pixel; outside, the border repeats.
+
+    Returns shape `(N, K)` or `(N, K, C)`.
+    """
+    blocks = [
+        cv2.remap(image, places[start : start + MOST_ROWS], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+        for start in range(0, len(places), MOST_ROWS)
+    ]
+    return np.concatenate(blocks) if len(blocks) > 1 else blocks[0]
 
 
 def _on_boundary(field: Floats, points: Floats, here: Floats) -> Bools:
     """Test the gradient of a flow at points, by central differences over two pixels."""
-    steps = np.array([[1, 0], [0, 1]], dtype=np.float32)
-    gradient = sum(
-        (((sample(field, points + step) - sample(field, points - step)) / 2) ** 2).sum(axis=1) for step in steps
-    )
+    around = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]], dtype=np.float32)
+    right, left, below, above = sample(field, points[:, None] + around).transpose(1, 0, 2)
+    gradient = (((right - left) / 2) ** 2 + ((below - above) / 2) ** 2).sum(axis=1)
     return np.asarray(gradient > EDGE_RATIO * (here**2).sum(axis=1) + EDGE_FLOOR)

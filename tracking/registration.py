@@ -15,11 +15,10 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pliant.tracking.appearance import cut
-from pliant.tracking.flow import Bools, Floats, Grey
+from pliant.tracking.flow import Bools, Floats, Grey, sample
 from pliant.tracking.seeding import LEAST_TEXTURE
 from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, cg
+from scipy.sparse.linalg import cg
 
 WINDOW = 21.0
 """Side of the window in which brightness and contrast are free, pixels. On a rendered face, registered once, 13, 21 and 31 give median
@@ -40,6 +39,9 @@ OUTLIER = 3.0
 STEPS, ITERATIONS = 4, 15
 """Gauss–Newton steps, and conjugate-gradient iterations in each. In the second round, 3 and 8 steps give errors 2 % larger and 2 % smaller
 on a rendered face."""
+
+MEDIAN_OF = 10_000
+"""Residuals whose median gives their scale, at least; its standard error is then 1 %."""
 
 LONGEST_STEP = 1.0
 """Maximum motion of a point in one step, px. Not tuned."""
@@ -71,6 +73,9 @@ class Registration:
     bending: sparse.csr_array
     """Second differences of a function of the points along rows, columns and diagonals, shape `(M, P)`."""
 
+    normal: NormalEquations
+    """Assembles the matrix of a Gauss–Newton step."""
+
     window: Window
     """Local means around the samples."""
 
@@ -84,21 +89,25 @@ class Registration:
     """Variance of the template's noise, square grey levels."""
 
     @classmethod
-    def of(cls, template: Grey, points: Floats, grid: NDArray[np.int32], *, noise: float) -> Registration:
+    def of(
+        cls, template: Grey, points: Floats, grid: NDArray[np.int32], *, noise: float, spacing: float = 1.0
+    ) -> Registration:
         """Prepare the registration of a template, a grey frame `(H, W)`.
 
         `points (P, 2)` are pixel positions on a regular grid; `grid (rows, columns)` holds their indices, −1 where there is none. `noise`
-        is the variance of the frames' noise, square grey levels.
+        is the variance of the frames' noise, square grey levels. The template is compared at samples `spacing` pixels apart.
         """
         corners = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]], axis=-1)
         full = np.asarray((corners >= 0).all(axis=-1))
         corners = corners[full]
         step = float(np.median(points[corners[:, 1], 0] - points[corners[:, 0], 0]))
-        side = max(2, round(step))
+        side = max(2, round(step / spacing))
         cells = Cells.of(corners, side, len(points))
         window = Window.of(full, side, width=WINDOW / step)
-        values = cut(template.astype(np.float32), cells.places(points)[:, None])[:, 0]
-        return cls(points, cells, _bending(grid, len(points)), window, values, step, noise)
+        values = sample(template.astype(np.float32), cells.places(points)).ravel()
+        stencils = _stencils(grid)
+        normal = NormalEquations.of(corners, stencils, len(points))
+        return cls(points, cells, _bending(stencils, len(points)), normal, window, values, step, noise)
 
     def refine(
         self, frame: Grey, points: Floats, variance: Floats, visible: Bools, *, steps: int = STEPS
@@ -126,9 +135,9 @@ class Registration:
 
     def _remaining(self, around: _Surroundings, picture: Floats, points: Floats) -> tuple[Floats, Floats]:
         """Return the variance of all points, square pixels, and the unexplained share of the template's contrast around them."""
-        values = cut(picture, self.cells.places(points)[:, None])[:, 0]
-        residual, contrast = around.residual(values[:, 0])
-        across, down = (values[:, 1:] / contrast[:, None]).T
+        grey, *slopes = self._cut(picture, points)
+        residual, contrast = around.residual(grey)
+        across, down = (slope / contrast for slope in slopes)
         parts = [across * across, across * down, down * down, residual * residual]
         xx, xy, yy, left = (self.cells.sums(around.mean(part)) for part in parts)
         least = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
@@ -137,31 +146,31 @@ class Registration:
         unlike = np.maximum(left, 0) / np.maximum(self.cells.sums(around.power), 1e-6)
         return np.asarray(variance, dtype=np.float32), np.asarray(unlike, dtype=np.float32)
 
+    def _cut(self, picture: Floats, points: Floats) -> Floats:
+        """Return grey levels and their derivatives at the samples, shape `(3, S)`, for points `(P, 2)`."""
+        return np.ascontiguousarray(sample(picture, self.cells.places(points)).reshape(-1, 3).T)
+
     def _step(self, around: _Surroundings, picture: Floats, moved: Floats, flowed: Floats) -> Floats:
         """Return one Gauss–Newton step of all points, shape `(P, 2)`."""
-        values = cut(picture, self.cells.places(moved)[:, None])[:, 0]
-        residual, contrast = around.residual(values[:, 0])
-        slopes = values[:, 1:] / contrast[:, None]
-        scale = 1.4826 * float(np.median(np.abs(residual[around.shown > 0]))) + 1e-3
-        weight = (around.shown / (1 + (residual / (OUTLIER * scale)) ** 2) / scale**2).astype(np.float32)
-        data = self.cells.normal(weight, slopes)
+        grey, *slopes = self._cut(picture, moved)
+        residual, contrast = around.residual(grey)
+        across, down = (slope / contrast for slope in slopes)
+        some = residual[around.shown > 0]
+        scale = 1.4826 * np.median(np.abs(some[:: max(1, len(some) // MEDIAN_OF)])) + np.float32(1e-3)
+        weight = around.shown / (1 + (residual / (OUTLIER * scale)) ** 2) / scale**2
         bent, deviation = self.bending @ (moved - self.points), BENDING * self.step
         stiffness = (1 / (1 + (bent**2).sum(axis=1) / (EDGE * deviation) ** 2) / deviation**2).astype(np.float32)
-        pulled = (weight * residual)[:, None] * slopes
-        pull = -np.stack([self.cells.sums(pulled[:, axis]) for axis in (0, 1)], axis=1)
+        matrix = self.normal.matrix(self.cells.squares(weight, across, down), stiffness)
+        pulled = weight * residual
+        pull = -np.stack([self.cells.sums(pulled * slope) for slope in (across, down)], axis=1)
         pull -= self.bending.T @ (stiffness[:, None] * bent) + HOLD * (moved - flowed)
-
-        def matvec(x: Floats) -> Floats:
-            field = x.reshape(-1, 2)
-            held = self.bending.T @ (stiffness[:, None] * (self.bending @ field)) + HOLD * field
-            return np.asarray(data @ x + held.ravel())
-
-        diagonal = data.diagonal() + np.repeat((self.bending.multiply(self.bending)).T @ stiffness, 2) + HOLD
-        size = (len(diagonal),) * 2
         solved, _ = cg(
-            LinearOperator(size, matvec=matvec, dtype=np.float32), pull.ravel(), rtol=1e-2, maxiter=ITERATIONS,
-            M=LinearOperator(size, matvec=lambda x: x / diagonal, dtype=np.float32),
-        )  # fmt: skip
+            matrix,
+            pull.ravel(),
+            rtol=1e-2,
+            maxiter=ITERATIONS,
+            M=sparse.diags_array(1 / matrix.diagonal(), format="csr"),
+        )
         return np.asarray(solved.reshape(-1, 2), dtype=np.float32)
 
 
@@ -181,12 +190,6 @@ class Cells:
     gather: sparse.csr_array
     """Matrix that sums the cells' corners by point, shape `(P, 4 C)`."""
 
-    pairs: sparse.csr_array
-    """Matrix that sums the cells' pairs of corners over the N pairs of points that share a cell, shape `(N, 16 C)`."""
-
-    pattern: tuple[NDArray[np.int32], NDArray[np.int32]]
-    """Columns and row pointers of these pairs in a matrix of P × P blocks."""
-
     @classmethod
     def of(cls, corners: NDArray[np.int32], side: int, num_points: int) -> Cells:
         """Lay out `side` × `side` samples in every cell."""
@@ -194,32 +197,88 @@ class Cells:
         right, down = (axis.ravel() for axis in np.meshgrid(inside, inside))
         weights = np.stack([(1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down], axis=1)
         products = (weights[:, :, None] * weights[:, None, :]).reshape(-1, 16)
-        pairs = np.repeat(corners, 4, axis=1).astype(np.int64) * num_points + np.tile(corners, (1, 4))
-        distinct, entry = np.unique(pairs, return_inverse=True)
-        rows = np.bincount(distinct // num_points, minlength=num_points)
-        pattern = (distinct % num_points).astype(np.int32), np.append(0, np.cumsum(rows)).astype(np.int32)
-        return cls(
-            corners, weights.astype(np.float32), products.astype(np.float32), _sums(corners.ravel(), num_points),
-            _sums(entry.ravel(), len(distinct)), pattern,
-        )  # fmt: skip
+        return cls(corners, weights.astype(np.float32), products.astype(np.float32), _sums(corners.ravel(), num_points))
 
     def places(self, points: Floats) -> Floats:
-        """Return the positions of the samples, shape `(S, 2)`, for points `(P, 2)`."""
-        return np.asarray((self.weights @ points[self.corners]).reshape(-1, 2))
+        """Return the positions of the samples, shape `(C, K, 2)`, for points `(P, 2)`."""
+        return np.stack([points[:, axis][self.corners] @ self.weights.T for axis in (0, 1)], axis=-1)
 
     def sums(self, values: Floats) -> Floats:
         """Return the weighted sums of sample values `(S,)` around every point, shape `(P,)`."""
         return np.asarray(self.gather @ (values.reshape(len(self.corners), -1) @ self.weights).ravel())
 
-    def normal(self, weight: Floats, slopes: Floats) -> sparse.bsr_array:
-        """Return the normal equations' matrix `(2P, 2P)` for residuals with weights `(S,)` and slopes `(S, 2)`."""
-        across, down = slopes.T
-        xx, xy, yy = (
-            self.pairs @ ((weight * product).reshape(len(self.corners), -1) @ self.products).ravel()
-            for product in (across * across, across * down, down * down)
-        )
-        blocks = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
-        return sparse.bsr_array((blocks, *self.pattern), shape=(2 * self.gather.shape[0],) * 2)
+    def squares(self, weight: Floats, across: Floats, down: Floats) -> Floats:
+        """Return the weighted squares x², xy and y² of slopes `(S,)`, summed over pairs of a cell's corners, shape `(3, 16 C)`."""
+        products = np.stack([weight * across * across, weight * across * down, weight * down * down])
+        return np.asarray((products.reshape(3, len(self.corners), -1) @ self.products).reshape(3, -1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEquations:
+    """Sums the matrix of a Gauss–Newton step over the N pairs of points that share a cell or a second difference."""
+
+    cells: sparse.csr_array
+    """Matrix that sums the cells' pairs of corners over the pairs of points, shape `(N, 16 C)`."""
+
+    bending: sparse.csr_array
+    """Matrix that sums the stiffness of the second differences over the pairs of points, shape `(N, M)`."""
+
+    own: NDArray[np.intp]
+    """Pairs of a point with itself, shape `(P,)`."""
+
+    entries: NDArray[np.int64]
+    """Entries of the matrix that hold a pair's 2 × 2 block, shape `(4, N)`."""
+
+    pattern: tuple[NDArray[np.int32], NDArray[np.int32]]
+    """Columns of the entries, and row pointers."""
+
+    @classmethod
+    def of(cls, corners: NDArray[np.int32], stencils: list[Stencil], num_points: int) -> NormalEquations:
+        """Find the pairs of points, in rows of the first."""
+        pairs = [_pairs(points, num_points) for points in (corners, *(stencil.points for stencil in stencils))]
+        distinct, pair = np.unique(np.concatenate([one.ravel() for one in pairs]), return_inverse=True)
+        of_cells, of_stencils = np.split(pair.ravel(), [pairs[0].size])
+        counts = [len(stencil.points) for stencil in stencils]
+        squares = [np.outer(stencil.values, stencil.values).ravel() for stencil in stencils]
+        values = np.concatenate([np.tile(square, count) for square, count in zip(squares, counts, strict=True)])
+        differences = np.repeat(np.arange(sum(counts)), np.repeat([square.size for square in squares], counts))
+        bending = sparse.csr_array((values, (of_stencils, differences)), shape=(len(distinct), sum(counts)))
+        first, second = np.divmod(distinct, num_points)
+        width = np.bincount(first, minlength=num_points)
+        before = np.cumsum(width) - width
+        upper = 2 * np.arange(len(distinct)) + 2 * before[first]
+        lower = upper + 2 * width[first]
+        entries = np.stack([upper, upper + 1, lower, lower + 1])
+        columns = np.zeros(4 * len(distinct), dtype=np.int32)
+        columns[entries] = [2 * second, 2 * second + 1, 2 * second, 2 * second + 1]
+        rows = np.append(0, np.cumsum(np.repeat(2 * width, 2))).astype(np.int32)
+        return cls(_sums(of_cells, len(distinct)), bending, np.flatnonzero(first == second), entries, (columns, rows))
+
+    def matrix(self, squares: Floats, stiffness: Floats) -> sparse.csr_array:
+        """Return the matrix `(2P, 2P)` for `squares (3, 16 C)`, see `Cells.squares`, and the stiffness `(M,)` of second differences."""
+        xx, xy, yy = (self.cells @ square for square in squares)
+        held = self.bending @ stiffness
+        held[self.own] += HOLD
+        values = np.zeros(self.entries.size, dtype=np.float32)
+        values[self.entries] = [xx + held, xy, xy, yy + held]
+        return sparse.csr_array((values, *self.pattern), shape=(2 * len(self.own),) * 2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stencil:
+    """A second difference at N places: the values of `L` points there, and their weights."""
+
+    points: NDArray[np.int32]
+    """Shape `(N, L)`."""
+
+    values: Floats
+    """Shape `(L,)`."""
+
+
+def _pairs(points: NDArray[np.int32], num_points: int) -> NDArray[np.int64]:
+    """Return the numbers `i P + j` of all pairs of points in every row of `points (N, L)`, shape `(N, L²)`."""
+    length = points.shape[1]
+    return np.repeat(points, length, axis=1).astype(np.int64) * num_points + np.tile(points, (1, length))
 
 
 def _sums(rows: NDArray[np.integer[Any]], count: int) -> sparse.csr_array:
@@ -297,26 +356,41 @@ class _Surroundings:
         return centred / contrast - self.template, contrast
 
 
-def _bending(grid: NDArray[np.int32], num_points: int) -> sparse.csr_array:
-    """Return the second differences; the mixed one counts twice, as in the Frobenius norm of the second derivatives."""
+def _stencils(grid: NDArray[np.int32]) -> list[Stencil]:
+    """Return the second differences along rows, columns and diagonals.
+
+    The mixed one counts twice, as in the Frobenius norm of the second derivatives.
+    """
     root = float(np.sqrt(2.0))
     stencils = (
         ((1.0, -2.0, 1.0), (grid[:, :-2], grid[:, 1:-1], grid[:, 2:])),
         ((1.0, -2.0, 1.0), (grid[:-2], grid[1:-1], grid[2:])),
         ((root, -root, -root, root), (grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:])),
     )
-    parts = []
+    found = []
     for values, cells in stencils:
         points = np.stack([cell.ravel() for cell in cells], axis=1)
-        points = points[(points >= 0).all(axis=1)]
-        pointers = np.arange(0, points.size + 1, len(values))
-        data = np.tile(np.array(values, dtype=np.float32), len(points))
-        parts.append(sparse.csr_array((data, points.ravel(), pointers), shape=(len(points), num_points)))
+        found.append(Stencil(points[(points >= 0).all(axis=1)], np.array(values, dtype=np.float32)))
+    return found
+
+
+def _bending(stencils: list[Stencil], num_points: int) -> sparse.csr_array:
+    """Return the matrix of the second differences, shape `(M, P)`."""
+    parts = [
+        sparse.csr_array(
+            (
+                np.tile(one.values, len(one.points)),
+                one.points.ravel(),
+                np.arange(0, one.points.size + 1, len(one.values)),
+            ),
+            shape=(len(one.points), num_points),
+        )
+        for one in stencils
+    ]
     return sparse.csr_array(sparse.vstack(parts))
 
 
 def _slopes(frame: Grey) -> Floats:
     """Return a frame and its derivatives in x and y, shape `(H, W, 3)`."""
-    image = frame.astype(np.float32)
-    across, down = (cv2.filter2D(image, cv2.CV_32F, kernel) for kernel in (DIFFERENCE, DIFFERENCE.T))
-    return np.asarray(cv2.merge([image, across, down]))
+    across, down = (cv2.filter2D(frame, cv2.CV_32F, kernel) for kernel in (DIFFERENCE, DIFFERENCE.T))
+    return np.asarray(cv2.merge([frame.astype(np.float32), across, down]))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pliant.solver.threads import available_cores
 from pliant.tracking.advice import warnings_before, warnings_of, warnings_unread
 from pliant.tracking.appearance import Appearance
-from pliant.tracking.chaining import Chain, chain
+from pliant.tracking.chaining import FIRST_SPACING, Chain, chain
 from pliant.tracking.contact_sheet import View, view_of
 from pliant.tracking.decoding.film import Film, open_film
 from pliant.tracking.decoding.limits import FilmLimits
@@ -188,17 +188,20 @@ def _carry(run: _Run, mask: Bools, origin: int, template: int) -> Bools:
 def _track(run: _Run, found: Survey, plan: _Plan, step: float | None, *, whole: bool) -> TrackedFilm:
     """Seed, chain, track again, drop points visible in few frames, and assemble the result."""
     template = run.store.read(plan.template)
-    seeds, rough = place(template, plan.mask, step=step or default_step(plan.mask))
+    seeds, textured = place(template, plan.mask, step=step or default_step(plan.mask))
     if len(seeds.points) < LEAST_POINTS:
         raise FilmError(
             "no_texture", field="region", expected=f"texture for at least {LEAST_POINTS} points in the template",
-            got=f"{len(seeds.points)} (texture in {rough:.0%} of the region)",
+            got=f"{len(seeds.points)} (texture in {textured:.0%} of the region)",
             hint="Draw a larger region, use a smaller grid_step, or film a surface with a pattern, in focus and in good light.",
         )  # fmt: skip
-    notes = warnings_before(run.film, found, plan.start, plan.stop, whole=whole, rough=rough)
+    notes = warnings_before(run.film, found, plan.start, plan.stop, whole=whole, rough=textured)
     run.on_warnings(notes)
     appearance = Appearance.of(template, plan.mask, seeds.points, neighbours(seeds.grid, len(seeds.points)))
-    registration = Registration.of(template, seeds.points, seeds.grid, noise=appearance.noise)
+    rough, fine = (
+        Registration.of(template, seeds.points, seeds.grid, noise=appearance.noise, spacing=spacing)
+        for spacing in (FIRST_SPACING, 1.0)
+    )
     length = plan.stop - plan.start
     done = 1
 
@@ -213,11 +216,11 @@ def _track(run: _Run, found: Survey, plan: _Plan, step: float | None, *, whole: 
         return run.store.read(plan.start + t)
 
     chained = chain(
-        read, length, plan.template - plan.start, appearance, registration,
+        read, length, plan.template - plan.start, appearance, rough,
         pool=run.pool, on_frame=on_frame, should_stop=run.should_stop,
     )  # fmt: skip
     track_again(
-        read, chained, plan.template - plan.start, appearance, registration,
+        read, chained, plan.template - plan.start, appearance, fine,
         pool=run.pool, on_frame=on_frame, should_stop=run.should_stop,
     )  # fmt: skip
     kept_grid, kept = keep(seeds.grid, chained.visible.mean(axis=0) >= LEAST_SEEN)

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 from pliant.tracking.appearance import Appearance
-from pliant.tracking.chaining import Chain, chain
+from pliant.tracking.chaining import Chain, _in_box, chain
 from pliant.tracking.registration import Registration
 from pliant.tracking.seeding import neighbours, place
 
@@ -85,3 +85,12 @@ def test_confidence_ignores_the_template_if_most_observations_are_in_it() -> Non
     assert (found[~visible] == 0).all()
     exact = Chain(np.zeros((4, 10, 2), np.float32), visible, np.zeros((4, 10), np.float32)).confidence
     assert (exact == visible).all()
+
+
+def test_a_flow_in_another_box_keeps_its_places_and_repeats_its_border() -> None:
+    rows, columns = np.mgrid[:20, :30].astype(np.float32)
+    picture = np.stack([columns, rows], axis=-1)
+    old, new = np.s_[4:12, 6:20], np.s_[2:10, 10:25]
+    inside = np.clip(picture, [6, 4], [19, 11])
+    np.testing.assert_array_equal(_in_box(picture[old], old, new), inside[new])
+    np.testing.assert_array_equal(_in_box(picture[old], old, np.s_[15:18, 24:29]), inside[15:18, 24:29])

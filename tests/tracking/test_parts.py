@@ -20,7 +20,7 @@ from pliant.tracking.decoding.pictures import natural
 from pliant.tracking.flow import dense_flow, match, opencv_serial, sample
 from pliant.tracking.frame_store import CACHED, FrameStore
 from pliant.tracking.region import read_region
-from pliant.tracking.registration import Registration
+from pliant.tracking.registration import HOLD, Registration
 from pliant.tracking.rendering import Truth, render_film
 from pliant.tracking.seeding import keep, neighbours, place, quads
 from pliant.tracking.survey import find_cuts, sharpest, tracking_scale
@@ -160,11 +160,32 @@ def test_matches_follow_the_motion_and_detect_lost_points() -> None:
     np.testing.assert_array_equal(found.lost, [False, False, True])
 
 
+def test_flow_continues_a_similar_one() -> None:
+    first, second = grey(step=30)
+    true = np.full((72, 96, 2), [30, 0], np.float32)
+    similar = true + np.float32(1)
+    with opencv_serial():
+        alone, continued = dense_flow(first, second), dense_flow(first, second, similar)
+    error, before = (np.linalg.norm(flow - true, axis=2)[16:-16, 8:56] for flow in (continued, alone))
+    assert np.quantile(error, 0.9) < 0.2 < 2 < np.quantile(before, 0.9)
+    np.testing.assert_array_equal(similar, true + 1)
+
+
+def test_registration_with_few_samples_ends_near_the_one_with_all() -> None:
+    registration, frame, true, flowed = registered(spacing=2)
+    assert len(registration.template) == len(registered()[0].template) / 4
+    everywhere, before = np.ones(len(true), bool), np.ones(len(true), np.float32)
+    found, _ = registration.refine(frame, flowed, before, everywhere)
+    assert np.median(np.linalg.norm(found - true, axis=1)) < 0.5 * np.median(np.linalg.norm(flowed - true, axis=1))
+
+
 def test_sampling_is_bilinear() -> None:
     rows, columns = np.mgrid[:5, :6].astype(np.float32)
     field = np.stack([2 * columns + rows, columns * rows], axis=-1)
     points = np.array([[1.5, 2.25], [0, 0], [5, 4], [-3, 9]], np.float32)
-    np.testing.assert_allclose(sample(field, points), [[5.25, 3.375], [0, 0], [14, 20], [4, 0]], atol=1e-5)
+    np.testing.assert_allclose(
+        sample(field, points[:, None])[:, 0], [[5.25, 3.375], [0, 0], [14, 20], [4, 0]], atol=1e-5
+    )
 
 
 def test_patches_detect_occlusion() -> None:
@@ -295,7 +316,7 @@ def test_rendered_films_are_written_in_known_containers_only(tmp_path: Path) -> 
     assert caught.value.code == "unwritable_film"
 
 
-def registered() -> tuple[Registration, np.ndarray, np.ndarray, np.ndarray]:
+def registered(spacing: float = 1.0) -> tuple[Registration, np.ndarray, np.ndarray, np.ndarray]:
     """Return a template's registration, a frame of it rotated under other light, the true positions there, and noisy flow."""
     wide = cv2.cvtColor(films.textured_pictures(1, (96, 72))[0], cv2.COLOR_RGB2GRAY)
     turn = cv2.getRotationMatrix2D((48, 36), 6, 1.05)
@@ -304,7 +325,8 @@ def registered() -> tuple[Registration, np.ndarray, np.ndarray, np.ndarray]:
     seeds, _ = place(wide, np.pad(np.ones((40, 64), bool), 16), step=4)
     true = seeds.points @ turn[:, :2].T.astype(np.float32) + turn[:, 2].astype(np.float32)
     flowed = true + np.random.default_rng(0).normal(0, 0.3, true.shape).astype(np.float32)
-    return Registration.of(wide, seeds.points, seeds.grid, noise=noise_variance(wide)), frame, true, flowed
+    made = Registration.of(wide, seeds.points, seeds.grid, noise=noise_variance(wide), spacing=spacing)
+    return made, frame, true, flowed
 
 
 def test_registration_corrects_the_error_of_the_flow() -> None:
@@ -362,8 +384,11 @@ def test_cells_interpolate_bilinearly_and_affine_motion_has_no_bending() -> None
     )
     np.testing.assert_allclose(cells.sums(weight), dense.T @ weight, rtol=1e-4)
     jacobian = np.einsum("sp,sc->spc", dense, slopes).reshape(len(weight), -1)
-    expected = jacobian.T @ (weight[:, None] * jacobian)
-    np.testing.assert_allclose(cells.normal(weight, slopes).toarray(), expected, atol=1e-4)
+    stiffness = rng.random(registration.bending.shape[0]).astype(np.float32)
+    bent = np.kron(registration.bending.toarray(), np.eye(2))
+    expected = jacobian.T @ (weight[:, None] * jacobian) + bent.T @ (np.repeat(stiffness, 2)[:, None] * bent)
+    found = registration.normal.matrix(cells.squares(weight, *slopes.T), stiffness)
+    np.testing.assert_allclose(found.toarray(), expected + HOLD * np.eye(2 * count), atol=1e-4)
 
 
 def test_shape_error_is_the_frame_error_after_one_scale_per_film() -> None:
