@@ -61,15 +61,37 @@ class Appearance:
         The patches follow the tracks' local affine maps, estimated from visible neighbours on the grid. The noise variance is added to the
         patches' own, so that two flat patches count as equal. The result does not depend on the number of threads in `pool`.
         """
-        image, affine = smooth(frame), self._affine(points, visible)
-        seen = visible & _by_blocks(
-            lambda block: self._correlates(image, points[block], affine[block], block), len(points), pool
-        )
+        seen = np.zeros(len(points), dtype=bool)
+        seen[visible] = self._alike(frame, points, visible, visible, pool)
+        return self._together(seen)
+
+    def found(self, frame: Grey, points: Floats, visible: Bools) -> Bools:
+        """Compare a frame with the template at hidden points, too; return the visible points and the hidden ones that are alike."""
+        alike = visible.copy()
+        alike[~visible] = self._alike(frame, points, ~visible, np.ones_like(visible), None)
+        return visible | self._together(alike)
+
+    def _together(self, seen: Bools) -> Bools:
+        """Hide points next to hidden ones."""
         beside = self.neighbours >= 0
         lost = np.count_nonzero(beside & ~seen[self.neighbours], axis=1)
         return np.asarray(seen & (lost < np.where(beside.all(axis=1), LOST_NEIGHBOURS, LOST_NEIGHBOURS - 1)))
 
-    def _correlates(self, image: Floats, points: Floats, affine: Floats, block: slice) -> Bools:
+    def _alike(
+        self, frame: Grey, points: Floats, tested: Bools, trusted: Bools, pool: ThreadPoolExecutor | None
+    ) -> Bools:
+        """Return which of the points `tested (P,)` have patches like the template's; `trusted` ones determine the affine maps."""
+        image, affine, some = smooth(frame), self._affine(points, trusted), np.flatnonzero(tested)
+        return np.asarray(
+            _by_blocks(
+                lambda block: self._correlates(image, points[some[block]], affine[some[block]], some[block]),
+                len(some),
+                pool,
+            ),
+            dtype=bool,
+        )
+
+    def _correlates(self, image: Floats, points: Floats, affine: Floats, block: NDArray[np.intp]) -> Bools:
         """Return which points of one block have patches like the template's."""
         template, inside = self.patches[block], self.inside[block]
         floor = inside.sum(axis=1) * np.float32(self.noise + 1.0)

@@ -12,7 +12,7 @@ from pliant.tracking.chaining import DELTAS, FIRST_SPACING, FIRST_STEPS, FLOW_MA
 from pliant.tracking.decoding.film import Film
 from pliant.tracking.flow import Bools, Grey, dense_flow, opencv_serial
 from pliant.tracking.region import Region, read_region
-from pliant.tracking.registration import STEPS, Registration
+from pliant.tracking.registration import Registration
 from pliant.tracking.seeding import Seeds, default_step, neighbours, place
 from pliant.tracking.survey import tracking_scale
 
@@ -93,8 +93,9 @@ def _rounds_seconds(grey: Grey, mask: Bools, seeds: Seeds) -> float:
     )
     beside, visible = seeds.points + np.float32(0.5), np.ones(len(seeds.points), dtype=bool)
     began = time.perf_counter()
-    for registration, steps, comparisons in ((rough, FIRST_STEPS, 1), (fine, STEPS, 2)):
-        registration.refine(grey, beside, np.ones_like(beside[:, 0]), visible, steps=steps)
-        for _ in range(comparisons):
-            appearance.agrees(grey, beside, visible)
+    rough.refine(grey, beside, np.ones_like(beside[:, 0]), visible, steps=FIRST_STEPS)
+    rough.spread(grey, beside, visible, steps=FIRST_STEPS)
+    fine.refine(grey, beside, np.ones_like(beside[:, 0]), visible)
+    for _ in range(2):
+        appearance.agrees(grey, beside, visible)
     return time.perf_counter() - began

@@ -106,11 +106,11 @@ def sample(image: Floats, places: Floats) -> Floats:
 
     Returns shape `(N, K)` or `(N, K, C)`.
     """
-    blocks = [
-        cv2.remap(image, places[start : start + MOST_ROWS], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-        for start in range(0, len(places), MOST_ROWS)
-    ]
-    return np.concatenate(blocks) if len(blocks) > 1 else blocks[0]
+    found = np.zeros((*places.shape[:2], *image.shape[2:]), dtype=image.dtype)
+    for start in range(0, len(places), MOST_ROWS):
+        part = slice(start, start + MOST_ROWS)
+        found[part] = cv2.remap(image, places[part], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    return found
 
 
 def _on_boundary(field: Floats, points: Floats, here: Floats) -> Bools:

@@ -220,7 +220,7 @@ def _track(run: _Run, found: Survey, plan: _Plan, step: float | None, *, whole: 
         pool=run.pool, on_frame=on_frame, should_stop=run.should_stop,
     )  # fmt: skip
     track_again(
-        read, chained, plan.template - plan.start, appearance, fine,
+        read, chained, plan.template - plan.start, appearance, rough, fine,
         pool=run.pool, on_frame=on_frame, should_stop=run.should_stop,
     )  # fmt: skip
     kept_grid, kept = keep(seeds.grid, chained.visible.mean(axis=0) >= LEAST_SEEN)

@@ -18,7 +18,7 @@ from pliant.solver import Tracks
 from pliant.solver.tracks.completion import choose_points, coefficients_of, fit_basis, predict
 from pliant.solver.tracks.normalization import normalize
 from pliant.tracking.appearance import Appearance
-from pliant.tracking.chaining import Chain, OnFrame, Read
+from pliant.tracking.chaining import FIRST_STEPS, Chain, OnFrame, Read
 from pliant.tracking.errors import TrackingStopped
 from pliant.tracking.flow import Bools, Floats
 from pliant.tracking.registration import Registration
@@ -60,7 +60,8 @@ def track_again(
     chained: Chain,
     template: int,
     appearance: Appearance,
-    registration: Registration,
+    rough: Registration,
+    fine: Registration,
     *,
     pool: ThreadPoolExecutor,
     on_frame: OnFrame,
@@ -68,7 +69,8 @@ def track_again(
 ) -> None:
     """Register every frame again from the predicted positions; points that match the template there become visible again.
 
-    Arguments are those of `chain`; `chained` is its result, whose arrays are overwritten.
+    Lost points are tried twice: where their paths predict them and, because paths of points that are often lost are inaccurate, where they
+    go along with the others in a rough registration. `chained` is the result of `chain`; its arrays are overwritten.
 
     Raises
     ------
@@ -80,9 +82,11 @@ def track_again(
 
     def again(t: int) -> tuple[Floats, Bools, Floats]:
         frame, path = read(t), chained.points[t]
-        like = appearance.agrees(frame, path, np.ones(len(path), dtype=bool))
-        points, variance = registration.refine(frame, path, chained.variance[t], like | chained.visible[t])
-        return points, appearance.agrees(frame, points, like | chained.visible[t]), variance
+        alike = appearance.found(frame, path, chained.visible[t])
+        near = rough.spread(frame, path, alike, steps=FIRST_STEPS)
+        alike = appearance.found(frame, near, alike)
+        points, variance = fine.refine(frame, near, chained.variance[t], alike)
+        return points, appearance.agrees(frame, points, alike), variance
 
     ahead: deque[tuple[int, Future[tuple[Floats, Bools, Floats]]]] = deque()
     frames = (t for t in range(len(chained.points)) if t != template)

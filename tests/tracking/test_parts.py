@@ -171,6 +171,27 @@ def test_flow_continues_a_similar_one() -> None:
     np.testing.assert_array_equal(similar, true + 1)
 
 
+def test_hidden_points_go_along_with_the_visible_ones_around_them() -> None:
+    registration, frame, true, flowed = registered()
+    inside = ((true - true.mean(axis=0)) ** 2).sum(axis=1) < 6**2
+    off = np.where(inside[:, None], flowed + np.float32([2, 0]), flowed)
+    error = np.linalg.norm(registration.spread(frame, off, ~inside) - true, axis=1)
+    assert error[inside].max() < 0.5 < 1.5 < np.linalg.norm(off - true, axis=1)[inside].mean()
+    assert np.median(error[~inside]) < 0.15
+    np.testing.assert_array_equal(registration.spread(frame, off, np.zeros(len(off), bool)), off)
+
+
+def test_hidden_points_that_look_like_the_template_are_found() -> None:
+    first, second = grey()
+    seeds, _ = place(first, np.pad(np.ones((40, 64), bool), 16), step=4)
+    look = Appearance.of(first, np.ones(first.shape, bool), seeds.points, neighbours(seeds.grid, len(seeds.points)))
+    moved, visible = seeds.points + np.float32([2, 0]), np.arange(len(seeds.points)) % 3 > 0
+    assert look.found(second, moved, visible).all()
+    blank = np.full_like(second, 128)
+    np.testing.assert_array_equal(look.found(blank, moved, visible), visible)
+    assert look.found(second, moved, np.ones(len(moved), bool)).all()
+
+
 def test_registration_with_few_samples_ends_near_the_one_with_all() -> None:
     registration, frame, true, flowed = registered(spacing=2)
     assert len(registration.template) == len(registered()[0].template) / 4

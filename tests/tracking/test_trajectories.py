@@ -86,7 +86,7 @@ def again(chained: Chain, *, stop: bool = False) -> tuple[Chain, np.ndarray, lis
     seen: list[int] = []
     with ThreadPoolExecutor(2) as pool:
         track_again(
-            lambda t: grey[t], chained, 0, appearance, registration,
+            lambda t: grey[t], chained, 0, appearance, registration, registration,
             pool=pool, on_frame=lambda t, points, visible: seen.append(t), should_stop=lambda: stop and len(seen) == 2,
         )  # fmt: skip
     return chained, true, seen
