@@ -114,10 +114,10 @@ class Registration:
     ) -> tuple[Floats, Floats]:
         """Move visible points from their flow positions to where a frame matches the template; return points and variances.
 
-        Variances are in square pixels. Points keep position and variance if they are hidden or if the frame shows something else around
-        them. The variance is that of the shift which would explain the remaining brightness difference: the mean squared residual around a
-        point over the mean squared slope in the direction of least slope. It is right for errors of the motion model and too large for film
-        noise, which averages out over the window.
+        Variances are in square pixels. Hidden points keep position and variance; points around which the frame shows something else keep
+        their position. The variance is that of the shift which would explain the remaining brightness difference: the mean squared residual
+        around a point over the mean squared slope in the direction of least slope. It is right for errors of the motion model and too large
+        for film noise, which averages out over the window.
         """
         shown = self._shown(visible)
         used = np.zeros(len(points), dtype=bool)
@@ -127,8 +127,8 @@ class Registration:
         around, picture = self._surroundings(shown), _slopes(frame)
         moved = self._moved(around, picture, points, steps)
         left, unlike = self._remaining(around, picture, moved)
-        believed = used & (unlike < UNLIKE)
-        return np.where(believed[:, None], moved, points), np.where(believed, left, variance)
+        matched = used & (unlike < UNLIKE)
+        return np.where(matched[:, None], moved, points), np.where(used, left, variance)
 
     def spread(self, frame: Grey, points: Floats, visible: Bools, *, steps: int = STEPS) -> Floats:
         """Move visible points to where a frame matches the template, and hidden ones along with the least bending; return all."""

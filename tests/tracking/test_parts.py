@@ -365,13 +365,13 @@ def test_registration_corrects_the_error_of_the_flow() -> None:
     np.testing.assert_array_equal(same, before)
 
 
-def test_registration_leaves_points_on_unrelated_pictures_unchanged() -> None:
+def test_registration_leaves_points_on_unrelated_pictures_in_place_with_a_large_variance() -> None:
     registration, _, true, flowed = registered()
     other = cv2.cvtColor(films.textured_pictures(1, (96, 72), seed=5)[0], cv2.COLOR_RGB2GRAY)
     visible, before = np.ones(len(true), bool), np.full(len(true), 0.5, np.float32)
     found, variance = registration.refine(other, flowed, before, visible)
     assert (found == flowed).all(axis=1).mean() > 0.95
-    assert (variance == before).mean() > 0.95
+    assert np.median(variance) > 4 * before[0]
 
 
 def test_registration_of_a_frame_with_itself_moves_nothing() -> None:
