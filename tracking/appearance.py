@@ -62,22 +62,26 @@ class Appearance:
         patches' own, so that two flat patches count as equal. The result does not depend on the number of threads in `pool`.
         """
         seen = np.zeros(len(points), dtype=bool)
-        seen[visible] = self._alike(frame, points, visible, visible, pool)
-        return self._together(seen)
+        seen[visible] = self._resembles(frame, points, visible, visible, pool)
+        return self._without_edges(seen)
 
     def found(self, frame: Grey, points: Floats, visible: Bools) -> Bools:
-        """Compare a frame with the template at hidden points, too; return the visible points and the hidden ones that are alike."""
-        alike = visible.copy()
-        alike[~visible] = self._alike(frame, points, ~visible, np.ones_like(visible), None)
-        return visible | self._together(alike)
+        """Compare a frame with the template at hidden points only.
 
-    def _together(self, seen: Bools) -> Bools:
-        """Hide points next to hidden ones."""
+        Return the visible points and those hidden ones that look like the template and do not lie beside points that stay hidden, see
+        `LOST_NEIGHBOURS`.
+        """
+        alike = visible.copy()
+        alike[~visible] = self._resembles(frame, points, ~visible, np.ones_like(visible), None)
+        return visible | self._without_edges(alike)
+
+    def _without_edges(self, seen: Bools) -> Bools:
+        """Hide points that have `LOST_NEIGHBOURS` hidden neighbours, or one at the edge of the grid."""
         beside = self.neighbours >= 0
         lost = np.count_nonzero(beside & ~seen[self.neighbours], axis=1)
         return np.asarray(seen & (lost < np.where(beside.all(axis=1), LOST_NEIGHBOURS, LOST_NEIGHBOURS - 1)))
 
-    def _alike(
+    def _resembles(
         self, frame: Grey, points: Floats, tested: Bools, trusted: Bools, pool: ThreadPoolExecutor | None
     ) -> Bools:
         """Return which of the points `tested (P,)` have patches like the template's; `trusted` ones determine the affine maps."""

@@ -4,8 +4,8 @@ After MFT (Neoral, Šerých, Matas, WACV 2024): a point of the template reaches 
 before t. Variances add along the way, a candidate loses a point if one of its links does, and of the candidates that see the point the one
 with the least variance is taken.
 
-Every flow starts from the one of the frame before, which finds long and fast motions more often and needs fewer steps. It depends on the
-points only through the box in which it is computed, so the flow to the next frame is computed while this frame's points are registered.
+Every flow also tries the vectors of the one before it, which finds long and fast motions more often and needs fewer steps. It depends on
+the points only through the boxes in which flow is computed, so the next frame's flow is computed while this frame's points are registered.
 """
 
 from __future__ import annotations

@@ -87,10 +87,8 @@ def _flow_seconds(grey: Grey, mask: Bools) -> float:
 def _rounds_seconds(grey: Grey, mask: Bools, seeds: Seeds) -> float:
     """Time the work of both rounds per frame besides flow: register and compare the frame with itself, half a pixel off."""
     appearance = Appearance.of(grey, mask, seeds.points, neighbours(seeds.grid, len(seeds.points)))
-    rough, fine = (
-        Registration.of(grey, seeds.points, seeds.grid, noise=appearance.noise, spacing=spacing)
-        for spacing in (FIRST_SPACING, 1.0)
-    )
+    fine = Registration.of(grey, seeds.points, seeds.grid, noise=appearance.noise)
+    rough = fine.coarse(grey, FIRST_SPACING)
     beside, visible = seeds.points + np.float32(0.5), np.ones(len(seeds.points), dtype=bool)
     began = time.perf_counter()
     rough.refine(grey, beside, np.ones_like(beside[:, 0]), visible, steps=FIRST_STEPS)
@@ -98,4 +96,5 @@ def _rounds_seconds(grey: Grey, mask: Bools, seeds: Seeds) -> float:
     fine.refine(grey, beside, np.ones_like(beside[:, 0]), visible)
     for _ in range(2):
         appearance.agrees(grey, beside, visible)
+        appearance.found(grey, beside, visible)
     return time.perf_counter() - began

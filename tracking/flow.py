@@ -22,11 +22,11 @@ EDGE_RATIO, EDGE_FLOOR = 0.01, 0.002
 """A motion boundary is where |∇u|² + |∇v|² > ratio · |w|² + floor (Sundaram et al., equation 6)."""
 
 STRIDE, DESCENTS, SMOOTHINGS = 4, 8, 3
-"""Distance of the patches in pixels, steps of their search, and of the smoothing after it, at every scale, if a similar flow is known.
-OpenCV's 3, 25 and 5 take 1.9 times as long and, on rendered films and a real face, keep at most .01 more of the observations."""
+"""For a flow that continues a similar one: pixels between patches, steps of their search, and steps of the smoothing after it, at every
+scale. OpenCV's 3, 25 and 5 take 1.9 times as long and, on rendered films and a real face, keep at most .01 more of the observations."""
 
-MOST_ROWS = 30_000
-"""Rows of positions that OpenCV reads at once; it stores the sizes of such maps in 16 bits."""
+MOST_PLACES = 30_000
+"""Rows or columns of positions that OpenCV reads at once; it stores the sizes of such maps in 16 bits."""
 
 _SERIAL = threading.Lock()
 _serial_users = 0
@@ -76,7 +76,7 @@ def opencv_serial() -> Iterator[None]:
 def dense_flow(first: Grey, second: Grey, similar: Floats | None = None) -> Floats:
     """Compute the flow from one frame to another by dense inverse search (Kroeger et al. 2016), shape `(H, W, 2)`, pixels.
 
-    The search starts from a `similar` flow of the same shape, if there is one, and is then shorter.
+    The search also tries the vectors of a `similar` flow of the same shape, if there is one, and is then shorter.
     """
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     if similar is None:
@@ -102,13 +102,16 @@ def match(forward: Floats, backward: Floats, points: Floats) -> Match:
 
 
 def sample(image: Floats, places: Floats) -> Floats:
-    """Interpolate an image `(H, W)` or `(H, W, C)` at positions `(N, K, 2)`, rounded to 1/32 pixel; outside, the border repeats.
+    """Interpolate an image `(H, W)` or `(H, W, C)` at positions `(N, K, 2)`; outside, the border repeats.
 
-    Returns shape `(N, K)` or `(N, K, C)`.
+    Returns shape `(N, K)` or `(N, K, C)`. OpenCV rounds some positions to 1/32 pixel, depending on its version and on C.
     """
+    if places.shape[1] > MOST_PLACES:
+        flat = sample(image, places.reshape(-1, 1, 2))
+        return flat.reshape(*places.shape[:2], *image.shape[2:])
     found = np.zeros((*places.shape[:2], *image.shape[2:]), dtype=image.dtype)
-    for start in range(0, len(places), MOST_ROWS):
-        part = slice(start, start + MOST_ROWS)
+    for start in range(0, len(places), MOST_PLACES):
+        part = slice(start, start + MOST_PLACES)
         found[part] = cv2.remap(image, places[part], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
     return found
 

@@ -1,7 +1,7 @@
 """Register all grid points of a template jointly to a frame.
 
 The image between four neighbouring points moves bilinearly with them (Szeliski and Coughlan, Spline-based image registration, 1997).
-Gauss–Newton steps minimise the squared difference between the warped frame and the template at every pixel, plus the bending of the motion;
+Gauss–Newton steps minimise the squared difference between the warped frame and the template, one or two pixels apart, plus the bending;
 brightness and contrast are free within a window. Pixels are not smoothed first, because this would remove the detail that distinguishes
 neighbouring positions. Points with little texture follow their neighbours, and no local affine maps have to be estimated from noisy tracks.
 Every frame is compared with the same template, so errors do not accumulate over the frames.
@@ -9,7 +9,7 @@ Every frame is compared with the same template, so errors do not accumulate over
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -51,7 +51,7 @@ DIFFERENCE = np.array([[1, -8, 0, 8, -1]], dtype=np.float32) / 12
 
 UNLIKE = 0.36
 """Maximum unexplained share of the template's contrast around a point; above it (correlation below .8) the frame shows something else
-there, and the point keeps its position."""
+there, and `refine` leaves the point where it was."""
 
 ROUNDING = 1e-4
 """Minimum variance, square pixels."""
@@ -73,6 +73,9 @@ class Registration:
     bending: sparse.csr_array
     """Second differences of a function of the points along rows, columns and diagonals, shape `(M, P)`."""
 
+    full: Bools
+    """Cells of the grid with a point at every corner, shape `(rows - 1, columns - 1)`."""
+
     normal: NormalEquations
     """Assembles the matrix of a Gauss–Newton step."""
 
@@ -89,35 +92,35 @@ class Registration:
     """Variance of the template's noise, square grey levels."""
 
     @classmethod
-    def of(
-        cls, template: Grey, points: Floats, grid: NDArray[np.int32], *, noise: float, spacing: float = 1.0
-    ) -> Registration:
+    def of(cls, template: Grey, points: Floats, grid: NDArray[np.int32], *, noise: float) -> Registration:
         """Prepare the registration of a template, a grey frame `(H, W)`.
 
         `points (P, 2)` are pixel positions on a regular grid; `grid (rows, columns)` holds their indices, −1 where there is none. `noise`
-        is the variance of the frames' noise, square grey levels. The template is compared at samples `spacing` pixels apart.
+        is the variance of the frames' noise, square grey levels. The samples are about one pixel apart, at least 2 × 2 in a cell.
         """
         corners = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]], axis=-1)
         full = np.asarray((corners >= 0).all(axis=-1))
         corners = corners[full]
         step = float(np.median(points[corners[:, 1], 0] - points[corners[:, 0], 0]))
-        side = max(2, round(step / spacing))
-        cells = Cells.of(corners, side, len(points))
-        window = Window.of(full, side, width=WINDOW / step)
-        values = sample(template.astype(np.float32), cells.places(points)).ravel()
+        cells, window, values = _samples(template, points, corners, full, step, 1.0)
         stencils = _stencils(grid)
         normal = NormalEquations.of(corners, stencils, len(points))
-        return cls(points, cells, _bending(stencils, len(points)), normal, window, values, step, noise)
+        return cls(points, cells, _bending(stencils, len(points)), full, normal, window, values, step, noise)
+
+    def coarse(self, template: Grey, spacing: float) -> Registration:
+        """Return the registration of the same template with samples about `spacing` pixels apart."""
+        cells, window, values = _samples(template, self.points, self.cells.corners, self.full, self.step, spacing)
+        return replace(self, cells=cells, window=window, template=values)
 
     def refine(
         self, frame: Grey, points: Floats, variance: Floats, visible: Bools, *, steps: int = STEPS
     ) -> tuple[Floats, Floats]:
         """Move visible points from their flow positions to where a frame matches the template; return points and variances.
 
-        Variances are in square pixels. Hidden points keep position and variance; points around which the frame shows something else keep
-        their position. The variance is that of the shift which would explain the remaining brightness difference: the mean squared residual
-        around a point over the mean squared slope in the direction of least slope. It is right for errors of the motion model and too large
-        for film noise, which averages out over the window.
+        Variances are in square pixels. Points keep position and variance if no cell around them is visible as a whole; those around which
+        the frame shows something else keep their position. The variance is that of the shift which would explain the remaining brightness
+        difference: the mean squared residual around a point over the mean squared slope in the direction of least slope. It is right for
+        errors of the motion model and too large for film noise, which averages out over the window.
         """
         shown = self._shown(visible)
         used = np.zeros(len(points), dtype=bool)
@@ -190,6 +193,16 @@ class Registration:
             M=sparse.diags_array(1 / matrix.diagonal(), format="csr"),
         )
         return np.asarray(solved.reshape(-1, 2), dtype=np.float32)
+
+
+def _samples(
+    template: Grey, points: Floats, corners: NDArray[np.int32], full: Bools, step: float, spacing: float
+) -> tuple[Cells, Window, Floats]:
+    """Lay out samples about `spacing` pixels apart in the cells; return cells, window and the template's grey levels."""
+    side = max(2, round(step / spacing))
+    cells = Cells.of(corners, side, len(points))
+    values = sample(template.astype(np.float32), cells.places(points)).ravel()
+    return cells, Window.of(full, side, width=WINDOW / step), values
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,8 +13,8 @@ from pliant.tracking.flow import Bools, Floats, Grey
 Ints = NDArray[np.int32]
 
 GRID_STEPS = (4.0, 8.0)
-"""Minimum and maximum default distance of neighbouring points, pixels of the tracker's frames. DIS has a match every 3 pixels of its finest
-level, 6 of the frame, so a finer grid adds points but little motion."""
+"""Minimum and maximum default distance of neighbouring points, pixels of the tracker's frames. DIS has a match every 3 or 4 pixels
+of its finest level, 6 or 8 of the frame, so a finer grid adds points but little motion."""
 
 WANTED_POINTS = 4000
 """Target number of points for the default distance: the solver makes a mesh of this size in minutes on two cores."""

@@ -198,10 +198,8 @@ def _track(run: _Run, found: Survey, plan: _Plan, step: float | None, *, whole: 
     notes = warnings_before(run.film, found, plan.start, plan.stop, whole=whole, rough=textured)
     run.on_warnings(notes)
     appearance = Appearance.of(template, plan.mask, seeds.points, neighbours(seeds.grid, len(seeds.points)))
-    rough, fine = (
-        Registration.of(template, seeds.points, seeds.grid, noise=appearance.noise, spacing=spacing)
-        for spacing in (FIRST_SPACING, 1.0)
-    )
+    fine = Registration.of(template, seeds.points, seeds.grid, noise=appearance.noise)
+    rough = fine.coarse(template, FIRST_SPACING)
     length = plan.stop - plan.start
     done = 1
 

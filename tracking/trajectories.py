@@ -3,7 +3,7 @@
 One frame alone cannot distinguish a wrong match from a right one, but all frames together can: the paths of all points lie near a
 low-dimensional space, in which the frames that match well determine a path (Irani, Multi-frame correspondence estimation using subspace
 constraints, 2002; Garg, Roussos, Agapito, 2013). Every frame is registered again from the paths in this space, and lost points are searched
-for there again.
+for there and, a pixel or two away, where the other points move them.
 """
 
 from __future__ import annotations

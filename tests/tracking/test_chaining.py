@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from pliant.tracking import chaining
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.chaining import Chain, _in_box, chain
 from pliant.tracking.registration import Registration
@@ -64,6 +65,25 @@ def test_points_moving_26_pixels_per_frame_are_tracked() -> None:
     result, true, _ = followed(26)
     assert result.visible[2:].mean() > 0.9
     assert np.median(np.linalg.norm(result.points - true, axis=2)[2:]) < 0.1
+
+
+@pytest.mark.parametrize("template", [0, 7])
+def test_every_flow_continues_one_between_similar_frames(monkeypatch: pytest.MonkeyPatch, template: int) -> None:
+    compute, motions = chaining.dense_flow, []
+
+    def recorded(first: np.ndarray, second: np.ndarray, similar: np.ndarray | None = None) -> np.ndarray:
+        flow = compute(first, second, similar)
+        motions.append([0.0 if each is None else float(np.median(each[..., 0])) for each in (similar, flow)])
+        return flow
+
+    monkeypatch.setattr(chaining, "dense_flow", recorded)
+    monkeypatch.setattr(chaining, "DELTAS", (1, 4))
+    followed(4, template=template)
+    # From the template to 7 frames, from the frame before to 6, over four frames to 3, each there and back.
+    assert len(motions) == 2 * (7 + 6 + 3)
+    starts, flows = np.array(motions).T
+    assert (starts == 0).sum() == 2
+    assert np.abs(flows - starts).max() == pytest.approx(4, abs=0.3)
 
 
 def test_points_are_recovered_after_an_occlusion() -> None:

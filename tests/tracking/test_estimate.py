@@ -47,6 +47,13 @@ def test_estimated_time_scales_with_frames_and_threads(film: Path, monkeypatch: 
     assert taken(film, threads=8).seconds == 40 * frame / 8
 
 
+def test_a_coarse_grid_can_be_estimated(tmp_path: Path) -> None:
+    path = films.write_film(tmp_path / "film.mkv", films.textured_pictures(3, (240, 180)))
+    found = estimate(open_film(path), region=None, region_frame=0, grid_step=100, longest_side=960, threads=1)
+    assert found.points == 4
+    assert found.seconds > 0
+
+
 def test_a_region_without_texture_is_estimated_at_zero_points(film: Path) -> None:
     region = np.zeros(SIZE[::-1], bool)
     region[12:60, 66:90] = True

@@ -189,7 +189,12 @@ def test_hidden_points_that_look_like_the_template_are_found() -> None:
     assert look.found(second, moved, visible).all()
     blank = np.full_like(second, 128)
     np.testing.assert_array_equal(look.found(blank, moved, visible), visible)
-    assert look.found(second, moved, np.ones(len(moved), bool)).all()
+    half, every = second.copy(), np.ones(len(moved), bool)
+    half[:, 50:] = 128
+    found = look.found(half, moved, ~every)
+    np.testing.assert_array_equal(found, look.agrees(half, moved, every))
+    assert found[moved[:, 0] < 38].mean() > 0.9
+    assert not found[moved[:, 0] > 58].any()
 
 
 def test_registration_with_few_samples_ends_near_the_one_with_all() -> None:
@@ -207,6 +212,17 @@ def test_sampling_is_bilinear() -> None:
     np.testing.assert_allclose(
         sample(field, points[:, None])[:, 0], [[5.25, 3.375], [0, 0], [14, 20], [4, 0]], atol=1e-5
     )
+
+
+def test_sampling_takes_any_number_of_positions_and_channels() -> None:
+    columns = np.tile(np.arange(8, dtype=np.float32), (6, 1))
+    places = np.random.default_rng(0).uniform([0, 0], [7, 5], (70_000, 2)).astype(np.float32)
+    for shape in ((70_000, 1, 2), (2, 35_000, 2), (1, 70_000, 2), (10_000, 7, 2)):
+        given = places.reshape(shape)
+        np.testing.assert_allclose(sample(columns, given), given[..., 0], atol=1 / 32)
+        channels = sample(cv2.merge([columns, 2 * columns, 3 * columns]), given)
+        np.testing.assert_allclose(channels, given[..., :1] * [1, 2, 3], atol=3 / 32)
+    assert sample(columns, places[:0, None]).shape == (0, 1)
 
 
 def test_patches_detect_occlusion() -> None:
@@ -337,7 +353,7 @@ def test_rendered_films_are_written_in_known_containers_only(tmp_path: Path) -> 
     assert caught.value.code == "unwritable_film"
 
 
-def registered(spacing: float = 1.0) -> tuple[Registration, np.ndarray, np.ndarray, np.ndarray]:
+def registered(spacing: float | None = None) -> tuple[Registration, np.ndarray, np.ndarray, np.ndarray]:
     """Return a template's registration, a frame of it rotated under other light, the true positions there, and noisy flow."""
     wide = cv2.cvtColor(films.textured_pictures(1, (96, 72))[0], cv2.COLOR_RGB2GRAY)
     turn = cv2.getRotationMatrix2D((48, 36), 6, 1.05)
@@ -346,8 +362,8 @@ def registered(spacing: float = 1.0) -> tuple[Registration, np.ndarray, np.ndarr
     seeds, _ = place(wide, np.pad(np.ones((40, 64), bool), 16), step=4)
     true = seeds.points @ turn[:, :2].T.astype(np.float32) + turn[:, 2].astype(np.float32)
     flowed = true + np.random.default_rng(0).normal(0, 0.3, true.shape).astype(np.float32)
-    made = Registration.of(wide, seeds.points, seeds.grid, noise=noise_variance(wide), spacing=spacing)
-    return made, frame, true, flowed
+    made = Registration.of(wide, seeds.points, seeds.grid, noise=noise_variance(wide))
+    return made if spacing is None else made.coarse(wide, spacing), frame, true, flowed
 
 
 def test_registration_corrects_the_error_of_the_flow() -> None:

@@ -145,6 +145,10 @@ def test_the_result_does_not_depend_on_threads(turning: tuple[Path, RenderedFilm
     two = track_film(path, region=film.region(8), region_frame=8, grid_step=3, threads=2)
     for name in ("tracks", "visibility", "confidence", "faces"):
         np.testing.assert_array_equal(getattr(tracked, name), getattr(two, name))
+    early = [
+        track_film(path, region=film.region(2), region_frame=2, grid_step=3, threads=threads) for threads in (1, 2)
+    ]
+    np.testing.assert_array_equal(early[0].tracks, early[1].tracks)
     assert cv2.getNumThreads() == before
 
 

@@ -84,9 +84,10 @@ def again(chained: Chain, *, stop: bool = False) -> tuple[Chain, np.ndarray, lis
     """Track the film again from given tracks; return the tracks, the true paths and the reported frames."""
     grey, true, appearance, registration = film()
     seen: list[int] = []
+    rough = registration.coarse(grey[0], 2.0)
     with ThreadPoolExecutor(2) as pool:
         track_again(
-            lambda t: grey[t], chained, 0, appearance, registration, registration,
+            lambda t: grey[t], chained, 0, appearance, rough, registration,
             pool=pool, on_frame=lambda t, points, visible: seen.append(t), should_stop=lambda: stop and len(seen) == 2,
         )  # fmt: skip
     return chained, true, seen
@@ -110,6 +111,20 @@ def test_the_second_pass_recovers_lost_points_and_corrects_wrong_ones() -> None:
     assert result.visible[3:5, 100:140].mean() > 0.95
     assert np.percentile(error[result.visible], 99) < 0.3
     assert seen == list(range(1, FRAMES))
+
+
+def test_lost_points_off_their_paths_are_found_with_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    true = film()[1]
+    lost = slice(100, 140)
+    visible = np.ones(true.shape[:2], bool)
+    visible[1:, lost] = False
+    points = true.copy()
+    points[1:, lost] += np.float32([0, 2.5])
+    monkeypatch.setattr("pliant.tracking.trajectories.move_to_expected", lambda chained, should_stop: None)
+    result, *_ = again(Chain(points, visible, np.full(visible.shape, 0.01, np.float32)))
+    assert result.visible[1:, lost].mean() > 0.95
+    error = np.linalg.norm(result.points - true, axis=2)[1:, lost]
+    assert np.percentile(error, 80) < 0.2
 
 
 def test_the_second_pass_can_be_stopped() -> None:
