@@ -134,9 +134,12 @@ class Registration:
         return np.where(matched[:, None], moved, points), np.where(used, left, variance)
 
     def spread(self, frame: Grey, points: Floats, visible: Bools, *, steps: int = STEPS) -> Floats:
-        """Move visible points to where a frame matches the template, and hidden ones along with the least bending; return all."""
+        """Move visible points to where a frame matches the template, and hidden ones along with the least bending; return all.
+
+        Without hidden points, or without visible ones, nothing moves.
+        """
         shown = self._shown(visible)
-        if not shown.any():
+        if visible.all() or not shown.any():
             return points
         return self._moved(self._surroundings(shown), _slopes(frame), points, steps)
 

@@ -178,7 +178,8 @@ def test_hidden_points_go_along_with_the_visible_ones_around_them() -> None:
     error = np.linalg.norm(registration.spread(frame, off, ~inside) - true, axis=1)
     assert error[inside].max() < 0.5 < 1.5 < np.linalg.norm(off - true, axis=1)[inside].mean()
     assert np.median(error[~inside]) < 0.15
-    np.testing.assert_array_equal(registration.spread(frame, off, np.zeros(len(off), bool)), off)
+    for visible in (np.zeros(len(off), bool), np.ones(len(off), bool)):
+        np.testing.assert_array_equal(registration.spread(frame, off, visible), off)
 
 
 def test_hidden_points_that_look_like_the_template_are_found() -> None:
