@@ -90,6 +90,7 @@ def _rounds_seconds(grey: Grey, mask: Bools, seeds: Seeds) -> float:
     fine = Registration.of(grey, seeds.points, seeds.grid, noise=appearance.noise)
     rough = fine.coarse(grey, FIRST_SPACING)
     beside, visible = seeds.points + np.float32(0.5), np.ones(len(seeds.points), dtype=bool)
+    visible[0] = False  # lost points are looked for only if there is one
     began = time.perf_counter()
     rough.refine(grey, beside, np.ones_like(beside[:, 0]), visible, steps=FIRST_STEPS)
     rough.spread(grey, beside, visible, steps=FIRST_STEPS)

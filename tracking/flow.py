@@ -23,7 +23,7 @@ EDGE_RATIO, EDGE_FLOOR = 0.01, 0.002
 
 STRIDE, DESCENTS, SMOOTHINGS = 4, 8, 3
 """For a flow that continues a similar one: pixels between patches, steps of their search, and steps of the smoothing after it, at every
-scale. OpenCV's 3, 25 and 5 take 1.9 times as long and, on rendered films and a real face, keep at most .01 more of the observations."""
+scale. OpenCV's 3, 25 and 5 take 1.9 times as long and, on rendered films and a real face, keep at most .015 more of the observations."""
 
 MOST_PLACES = 30_000
 """Rows or columns of positions that OpenCV reads at once; it stores the sizes of such maps in 16 bits."""

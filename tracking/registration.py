@@ -115,7 +115,7 @@ class Registration:
     def refine(
         self, frame: Grey, points: Floats, variance: Floats, visible: Bools, *, steps: int = STEPS
     ) -> tuple[Floats, Floats]:
-        """Move visible points from their flow positions to where a frame matches the template; return points and variances.
+        """Move visible points from given positions to where a frame matches the template; return points and variances.
 
         Variances are in square pixels. Points keep position and variance if no cell around them is visible as a whole; those around which
         the frame shows something else keep their position. The variance is that of the shift which would explain the remaining brightness
