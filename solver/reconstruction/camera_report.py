@@ -63,7 +63,9 @@ def described(view: Perspective, unit: float) -> str:
         )
     compared = [each for each in nll if each != 0 and (view.given is None or abs(each) == view.given)]
     gain = nll[0.0] - min((nll[each] for each in compared), default=nll[0.0])
-    how = "as given" if view.given is not None else f"± {unit * view.curvature_std / view.curvature**2:.2g}"
+    how = (
+        "as given" if view.given is not None else f"± {float(f'{unit * view.curvature_std / view.curvature**2:.2g}'):g}"
+    )
     return (
         f"Perspective with focal length {unit / abs(view.curvature):.4g} {how}: gains {gain:.3f} in the log likelihood per point and frame "
         "over orthography."

@@ -12,6 +12,9 @@ E is the negative log likelihood without the camera-motion prior, a the variance
 The penalty is the negative log density of log x for x with an F distribution of 1 and 2 degrees of freedom, the ratio of a variance along
 one axis to one along two. It is dimensionless and grows as 2 log λ and log 1/λ. If the object rotates by tens of degrees, E dominates and
 λ is 1 to within a fraction of a percent.
+
+Perspective does not resolve the ambiguity unless the focal length φ is known: images of depths λz with focal length λφ have the same
+z/φ, so tracks corrected for perspective are those of an orthographic camera, and E(λ) is that of these tracks.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from pliant.solver.model.so3 import exponential
 from pliant.solver.records import Floats
 from pliant.solver.refinement.learned import Learned, motion_of, scene_at
 from scipy.optimize import minimize_scalar
+from scipy.special import polygamma
 
 VISIBLE_DEPTH = (1 / 2 - 4 / 9) ** 0.5 / 0.5
 """r, standard deviation of depth over that of x or y: .47 for the half of a sphere that faces the camera, with points evenly spread over
@@ -34,6 +38,9 @@ MAX_STRETCH = 30.0
 
 DECIDED = 1.25
 """λ or 1/λ below which the depth counts as determined by the tracks."""
+
+LOG_DEPTH_STD = float(polygamma(1, 0.5) + polygamma(1, 1.0)) ** 0.5 / 2
+"""Standard deviation of ½ log x under the prior, 1.28: a typical depth may be wrong by a factor of 3 or 4."""
 
 MAX_ANGLE = np.radians(60.0)
 """Angle from d, rad, that no frame may exceed after the step: bas-relief is an approximation for small angles."""
@@ -77,6 +84,11 @@ def settled_depth(gram: Floats, found: Learned) -> tuple[Learned, float]:
     moved = _stretched(found, float(np.exp(at)), toward, rolls, tilts)
     scene = scene_at(gram, moved.rotations, with_scales=True, ordered=moved.covariance.ordered)
     return replace(moved, energy=energy(scene, motion_of(scene, moved))[0]), float(np.exp(at))
+
+
+def is_typical(stretch: float) -> bool:
+    """Whether the prior determines the depth: λ or 1/λ is at least `DECIDED`."""
+    return bool(abs(np.log(stretch)) >= np.log(DECIDED))
 
 
 def bulges(found: Learned, sample: Floats, *, y_up: bool) -> bool:

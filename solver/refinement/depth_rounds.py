@@ -14,6 +14,7 @@ from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR
 from pliant.solver.records import Floats, read_only
+from pliant.solver.refinement.bas_relief import LOG_DEPTH_STD
 from pliant.solver.refinement.depth_alternation import alternated, factorized_again
 from pliant.solver.refinement.focal_length import search
 from pliant.solver.refinement.learned import Learned, stretched
@@ -129,6 +130,25 @@ def settled_again(
     whole = replace(found, scales=found.scales * scales)
     whole, view = alternated(view, whole, used, model_order=model_order, turning=True, should_stop=should_stop)
     return _applied(estimate, normalized, used, whole, view), replace(whole, scales=whole.scales / scales)
+
+
+def with_stretched_depth(
+    estimate: CameraEstimate,
+    normalized: Normalized,
+    used: NDArray[np.intp],
+    found: Learned,
+    scales: Floats,
+    stretch: float,
+) -> CameraEstimate:
+    """Return the estimate with the depths of `found`, λ = `stretch` times the previous ones, and κ/λ, which change the tracks alike.
+
+    `found` belongs to tracks divided by `scales`, shape `(F',)`. The prior on the depth determines κ only as well as the depth.
+    """
+    view = estimate.perspective
+    assert view is not None
+    curvature, std = view.curvature / stretch, view.curvature_std / stretch
+    view = replace(view, curvature=curvature, curvature_std=float(np.hypot(std, LOG_DEPTH_STD * curvature)))
+    return _applied(estimate, normalized, used, replace(found, scales=found.scales * scales), view)
 
 
 def with_depth_map(

@@ -20,9 +20,9 @@ from pliant.solver.model.model_order import ModelOrder, select_model_order
 from pliant.solver.model.so3 import MIRROR, angles_between
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only
-from pliant.solver.refinement.bas_relief import DECIDED, bulges, settled_depth
+from pliant.solver.refinement.bas_relief import bulges, is_typical, settled_depth
 from pliant.solver.refinement.covariance_learning import LearningData
-from pliant.solver.refinement.depth_rounds import settled, settled_again
+from pliant.solver.refinement.depth_rounds import settled, settled_again, with_stretched_depth
 from pliant.solver.refinement.evidence import Evidence
 from pliant.solver.refinement.free_scales import SCALE_ROUNDS, ScaleTrial, try_free_scales
 from pliant.solver.refinement.learned import Learned, learned_at, refined, scene_at, turned
@@ -191,9 +191,11 @@ def _refined(
         found = _coupled(evidence.gram, found, with_scales=with_scales, should_stop=should_stop)
         if bends:
             evidence, found = _with_settled_depths(evidence, normalized, found, model_order, should_stop)
-    if not bends and np.isfinite(found.energy):
-        return _with_probable_depth(evidence, found, model_order, should_stop)
-    return evidence, found
+    if not np.isfinite(found.energy):
+        return evidence, found
+    if bends:
+        return _with_probable_focal(evidence, normalized, found)
+    return _with_probable_depth(evidence, found, model_order, should_stop)
 
 
 def _first_rounds(
@@ -237,6 +239,26 @@ def _with_probable_depth(
     if estimate.depth_is_typical:
         found = best_candidate(estimate, evidence.gram, evidence.used, found, model_order, should_stop)
     return replace(evidence, estimate=estimate), found
+
+
+def _with_probable_focal(evidence: Evidence, normalized: Normalized | None, found: Learned) -> tuple[Evidence, Learned]:
+    """Return tracks, cameras and covariance at the most probable depth and the focal length that belongs to it.
+
+    λ times the depth, seen with λ times the focal length, shows the same perspective. If the tracks or a given focal length determine the
+    depth, nothing changes.
+    """
+    view = evidence.estimate.perspective
+    assert view is not None
+    assert normalized is not None
+    if view.given is not None:
+        return evidence, found
+    moved, stretch = settled_depth(evidence.gram, found)
+    if not is_typical(stretch):
+        return evidence, found
+    estimate = with_stretched_depth(
+        evidence.estimate, normalized, evidence.used, moved, evidence.start_scales[evidence.used], stretch
+    )
+    return evidence.corrected(_with_depth_choice(estimate, stretch)), moved
 
 
 def _mirrored(estimate: CameraEstimate, rotations: Floats, found: Learned) -> tuple[CameraEstimate, Floats, Learned]:
@@ -307,11 +329,13 @@ def _with_rotation_reason(estimate: CameraEstimate, rotations: Floats, before: F
 
 
 def _with_depth_choice(estimate: CameraEstimate, stretch: float) -> CameraEstimate:
-    """Return the estimate, with a sentence if the prior determines the extent of depth: λ or 1/λ is at least `DECIDED`."""
-    if abs(np.log(stretch)) < np.log(DECIDED):
+    """Return the estimate, with a sentence if the prior determines the extent of depth."""
+    if not is_typical(stretch):
         return estimate
     sentence = (
         f"The tracks hardly distinguish depth from rotation: {1 / stretch:.2g} times the depth with {stretch:.2g} times the rotation "
         "explains them about as well. The depth is typical for the width, like that of half a sphere."
     )
+    if estimate.perspective is not None and estimate.perspective.bends:
+        sentence += " The focal length shows the tracks' perspective at this depth."
     return replace(estimate, depth_is_typical=True, reasons={**estimate.reasons, "depth_extent": sentence})

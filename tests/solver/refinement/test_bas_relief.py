@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pliant.solver import Settings, Tracks, estimate_cameras, gallery, solve
+from pliant.solver.gallery.sequence import Sequence
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR, angles_between, exponential
 from pliant.solver.refinement import bas_relief, joint_refinement
-from pliant.solver.refinement.bas_relief import VISIBLE_DEPTH, bulges, extent_penalty, settled_depth
+from pliant.solver.refinement.bas_relief import LOG_DEPTH_STD, VISIBLE_DEPTH, bulges, extent_penalty, settled_depth
+from pliant.solver.refinement.depth_rounds import with_stretched_depth
 from pliant.solver.refinement.learned import Learned
+from pliant.solver.tracks.normalization import normalize
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
@@ -35,6 +40,15 @@ def test_the_expected_depth_is_that_of_half_a_sphere() -> None:
     assert np.sqrt(1 - x[inside] ** 2 - y[inside] ** 2).std() / x[inside].std() == pytest.approx(
         VISIBLE_DEPTH, rel=2e-3
     )
+
+
+def test_the_prior_leaves_a_factor_of_3_or_4_of_depth() -> None:
+    logs = np.linspace(-25, 25, 20001)
+    density = np.exp([-extent_penalty(np.exp(2 * log)) for log in logs])
+    density /= density.sum()
+    spread = np.sqrt(density @ logs**2 - (density @ logs) ** 2)
+    assert spread == pytest.approx(LOG_DEPTH_STD, rel=1e-3)
+    assert 3 < np.exp(LOG_DEPTH_STD) < 4
 
 
 def test_the_penalty_is_least_at_the_expected_ratio_and_steeper_for_deep_objects() -> None:
@@ -125,6 +139,65 @@ def test_a_head_that_turns_by_30_degrees_keeps_its_depth(monkeypatch: pytest.Mon
     cameras = estimate_cameras(tracks)
     assert stretches == [pytest.approx(1, abs=0.01)], "the candidates are not compared"
     assert "depth_extent" not in cameras.estimate.reasons
+
+
+def nearby(head: Sequence, noise: float = 0.0) -> Tracks:
+    """Tracks in a picture of 1280×720 of a head three half-sizes away, φ = 900 px."""
+    seen = (head.shapes - head.shapes.mean(axis=1, keepdims=True)) @ head.rotations.transpose(0, 2, 1)
+    seen *= 300 / np.abs(seen).max()
+    tracks = Tracks.from_arrays(np.array([639.5, 359.5]) + seen[..., :2] / (1 + seen[..., 2:] / 900))
+    return gallery.corrupt_tracks(tracks, noise=noise, seed=0)[0]
+
+
+def test_perspective_is_the_same_at_twice_the_depth_and_twice_the_focal_length(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a prior determines the depth, the focal length follows, and is no better known than the depth."""
+    tracks, before = nearby(gallery.face(12, 40, degrees=8, tilt=2)), []
+
+    def settled(gram: np.ndarray, given: Learned) -> tuple[Learned, float]:
+        before.append(given)
+        return bas_relief._stretched(given, 2.0, *bas_relief._decomposed(given.rotations)), 2.0
+
+    monkeypatch.setattr(joint_refinement, "settled_depth", settled)
+    settings = Settings(camera="perspective", image_size=(1280.0, 720.0), basis_size=2)
+    deep = estimate_cameras(tracks, settings=settings).estimate
+    assert deep.perspective is not None
+    assert deep.depth_is_typical
+    assert deep.perspective.curvature_std > LOG_DEPTH_STD * abs(deep.perspective.curvature)
+    assert "focal length" in deep.reasons["depth_extent"]
+
+    strong = replace(deep, perspective=replace(deep.perspective, curvature=0.04))
+    (given,) = before
+    normalized, scales, used = normalize(tracks), np.ones(12), np.arange(12)
+    plain = with_stretched_depth(strong, normalized, used, given, scales, 1.0)
+    moved, _ = settled(plain.gram, given)
+    twice = with_stretched_depth(strong, normalized, used, moved, scales, 2.0)
+    assert twice.perspective is not None
+    assert twice.perspective.curvature == 0.02
+    view = deep.perspective.sample
+    bent = (plain.sample - view + view.mean(axis=1, keepdims=True)).std()
+    assert bent > 0.005
+    assert (twice.sample - plain.sample).std() < 0.1 * bent
+
+
+def test_a_given_focal_length_determines_the_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(joint_refinement, "settled_depth", None)
+    settings = Settings(focal=900.0, image_size=(1280.0, 720.0), basis_size=2)
+    found = estimate_cameras(nearby(gallery.face(8, 40, degrees=4)), settings=settings).estimate
+    assert not found.depth_is_typical
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_a_near_head_that_turns_by_2_degrees_gets_a_plausible_depth() -> None:
+    """Without the step, the depth is 3.8 times the true one, and the focal length 15 times."""
+    head = gallery.face(12, 60, degrees=1, tilt=0.5, seed=1)
+    settings = Settings(camera="perspective", image_size=(1280.0, 720.0))
+    solution = solve(nearby(head, noise=0.003), head.mesh, settings=settings)
+    found = depth_of(solution.shapes, solution.camera.rotations)
+    assert 0.5 < found / depth_of(head.shapes, head.rotations) < 2
+    assert solution.camera.focal is not None
+    assert solution.camera.focal_std is not None
+    assert abs(solution.camera.focal - 900) < solution.camera.focal_std
 
 
 @pytest.mark.parametrize("y_up", [False, True])
