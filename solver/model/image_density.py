@@ -85,6 +85,9 @@ class Terms:
     by_walk_variance: float
     """∂E/∂τ."""
 
+    inverse: Floats | None = None
+    """V⁻¹, shape `(2F, 2F)`, where it was needed."""
+
 
 def factor_of(gram: Floats) -> Floats:
     """Return F₀ with F₀F₀ᵀ = G to rounding and rank(G) columns: a pivoted Cholesky factor."""
@@ -124,6 +127,7 @@ def dense_terms(model: ImageModel, factor: Floats) -> Terms:
     return Terms(
         0.5 * (log_det + float(np.vdot(explained, factor))) / frames, slope @ model.columns,
         by_walk.reshape(frames, 2, 3), 0.5 * float(slope.trace()), 0.5 * float(np.vdot(by_walk, rows)) / model.walk_variance,
+        inverse,
     )  # fmt: skip
 
 

@@ -26,7 +26,7 @@ from typing import Protocol
 import numpy as np
 from pliant.solver.model.camera_motion_prior import STEADY, rotation_roughness, scale_roughness
 from pliant.solver.model.frame_metric import FrameMetric
-from pliant.solver.model.image_density import ImageModel, factor_of, inverted, terms
+from pliant.solver.model.image_density import ImageModel, Terms, factor_of, inverted, terms
 from pliant.solver.model.so3 import exponential_and_jacobian, vee
 from pliant.solver.records import Floats
 from scipy.optimize import minimize
@@ -208,16 +208,6 @@ def _image(
     return ImageModel(columns, walk, noise + scene.noise_std_floor**2, walk_variance, scene.ordered)
 
 
-def energy_with_inverse(scene: Scene, motion: Motion) -> tuple[float, Motion, Floats | None]:
-    """Return E, its gradient and M⁻¹, shape `(2F, 2F)`, for ∂E/∂G = M⁻¹/2F; None where M is not positive definite."""
-    value, gradient = energy(scene, motion)
-    if value == UNLIKELY:
-        return value, gradient, None
-    return value, gradient, inverted(image_of(scene, motion).covariance())[0]
-
-
-# A line search may try a step that overflows: its energy is then `UNLIKELY`.
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     """Return E with the penalties on modes, rotations and scales, and its gradient, analytic in every parameter.
 
@@ -225,6 +215,23 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     Rotations move on SO(3)^F by the exponential map, whose left Jacobian maps the gradient from the rotation to its
     vector.
     """
+    value, gradient, _ = _energy(scene, motion)
+    return value, gradient
+
+
+def energy_with_inverse(scene: Scene, motion: Motion) -> tuple[float, Motion, Floats | None]:
+    """Return E, its gradient and M⁻¹, shape `(2F, 2F)`, for ∂E/∂G = M⁻¹/2F; None where M is not positive definite."""
+    value, gradient, found = _energy(scene, motion)
+    if found is None:
+        return value, gradient, None
+    inverse = found.inverse
+    return value, gradient, inverted(image_of(scene, motion).covariance())[0] if inverse is None else inverse
+
+
+# A line search may try a step that overflows: its energy is then `UNLIKELY`.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def _energy(scene: Scene, motion: Motion) -> tuple[float, Motion, Terms | None]:
+    """Return E, its gradient, and the terms of the density; no terms where M is not positive definite."""
     frames = len(scene.rotations)
     rotations, scales, jacobian = cameras_and_jacobian(scene, motion)
     projections = rotations[:, :2] * scales[:, None, None]
@@ -235,7 +242,7 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
         model = _image(scene, motion.modes, projections, root0, root1, noise, walk_variance)
         found = terms(model, scene.factor)
     except np.linalg.LinAlgError:
-        return UNLIKELY, Motion.unflat(np.zeros_like(motion.flat()), frames)
+        return UNLIKELY, Motion.unflat(np.zeros_like(motion.flat()), frames), None
     by_mean, rows = found.by_columns[:, :3], projections.reshape(-1, 3)
     # By the images of each mode in each frame. Products of matrices take half the time of `einsum`, which matters for short films.
     by_images = found.by_columns[:, 3:].reshape(frames, 2, -1, 3).transpose(0, 2, 1, 3).reshape(frames, -1, 6)
@@ -256,7 +263,7 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
         (rows.T @ by_walk)[LOWER],
         np.array([2 * found.by_noise_variance * noise, 2 * found.by_walk_variance * walk_variance]),
     )
-    return found.value + rough + rough_cameras, gradient
+    return found.value + rough + rough_cameras, gradient, found
 
 
 def fit(

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats
+from pliant.solver.threads import SMALLEST, over_ranges
 from pliant.solver.tracks.completion import MIN_RESIDUAL_SCALE
 from scipy import linalg
 from scipy.special import expit
@@ -127,12 +128,16 @@ class ImageDensity:
             for i, j in ((0, 0), (1, 1), (0, 1))
         )
         for found in self._conditionals(weight):
-            columns = self.precision[:, found.rows].transpose(1, 0, 2)  # (n, 2F, m)
-            spread = columns @ found.covariances
-            at = found.points
-            pulled[:, at] -= np.einsum("nfi,ni->fn", spread, pulled[found.rows, at[:, None]])
-            for block, i, j in ((xx, 0, 0), (yy, 1, 1), (xy, 0, 1)):
-                block[:, at] -= np.einsum("nfi,nfi->fn", spread[:, i::2], columns[:, j::2])
+
+            def work(start: int, stop: int, found: Conditionals = found) -> None:
+                rows, at = found.rows[start:stop], found.points[start:stop]
+                columns = self.precision[:, rows].transpose(1, 0, 2)  # (n, 2F, m)
+                spread = columns @ found.covariances[start:stop]
+                pulled[:, at] -= np.einsum("nfi,ni->fn", spread, pulled[rows, at[:, None]])
+                for block, i, j in ((xx, 0, 0), (yy, 1, 1), (xy, 0, 1)):
+                    block[:, at] -= np.einsum("nfi,nfi->fn", spread[:, i::2], columns[:, j::2])
+
+            over_ranges(work, len(found.points), smallest=max(1, SMALLEST // (len(pulled) * found.rows.shape[1])))
         confidence, weight = np.where(seen, confidence, 1.0), np.where(seen, weight, 1.0)
         xx, yy, xy = np.where(seen, xx, 1.0), np.where(seen, yy, 1.0), np.where(seen, xy, 0.0)
         pulled = np.where(np.repeat(seen, 2, axis=0), pulled, 0.0)
@@ -158,12 +163,19 @@ class ImageDensity:
         rows = np.repeat(2 * frames, 2, axis=1)
         rows[:, 1::2] += 1
         own = np.repeat(np.take_along_axis(weight.T, frames, axis=1), 2, axis=1)
-        inner = self.precision[rows[:, :, None], rows[:, None, :]] * (real[:, :, None] & real[:, None, :])
-        places = np.arange(2 * most)
-        inner[:, places, places] += np.where(real, own / np.where(real, 1 - own, 1.0) / self.noise, 1.0)
-        covariances = np.linalg.inv(inner)
-        covariances[:, places, places] *= real
-        return Conditionals(points, np.where(real, rows, 0), (covariances + covariances.transpose(0, 2, 1)) / 2)
+        added = np.where(real, own / np.where(real, 1 - own, 1.0) / self.noise, 1.0)
+        places, covariances = np.arange(2 * most), np.zeros((len(points), 2 * most, 2 * most))
+
+        def work(start: int, stop: int) -> None:
+            at, inside = rows[start:stop], real[start:stop]
+            inner = self.precision[at[:, :, None], at[:, None, :]] * (inside[:, :, None] & inside[:, None, :])
+            inner[:, places, places] += added[start:stop]
+            inverse = np.linalg.inv(inner)
+            inverse[:, places, places] *= inside
+            covariances[start:stop] = (inverse + inverse.transpose(0, 2, 1)) / 2
+
+        over_ranges(work, len(points), smallest=max(1, SMALLEST // (2 * most) ** 2))
+        return Conditionals(points, np.where(real, rows, 0), covariances)
 
 
 def _predicted(pulled: Floats, blocks: tuple[Floats, Floats, Floats], own: Floats) -> tuple[Floats, Floats]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pliant.solver.model import observation_model
 from pliant.solver.model.observation_model import CERTAIN, SHARE_BOUNDS, ImageDensity, inlier_probabilities
 from pliant.solver.records import Floats
+from pliant.solver.threads import threads_limited
 
 FRAMES, POINTS, NOISE = 7, 30, 0.01
 
@@ -54,6 +57,20 @@ def test_expected_tracks_are_the_conditional_moments() -> None:
         np.testing.assert_allclose(means[:, point], gain @ points[seen, point].ravel(), atol=1e-9)
         expected += covariance - gain @ covariance[rows]
     np.testing.assert_allclose(total, expected, atol=1e-9)
+
+
+def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(4)), raising=False)
+    monkeypatch.setattr(observation_model, "SMALLEST", 1)
+    covariance, points = paths()
+    confidence, weight = partly_seen()
+    points = np.where(weight[..., None] > 0, points, 0.0)
+    density, results = ImageDensity.of(covariance, NOISE), []
+    for threads in (1, 4):
+        with threads_limited(threads):
+            results.append((*density.moments(points, weight), *density.left_out(points, confidence, weight)))
+    for alone, together in zip(*results, strict=True):
+        np.testing.assert_array_equal(together, alone)
 
 
 def test_complete_tracks_are_their_own_expectation() -> None:
