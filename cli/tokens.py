@@ -37,7 +37,7 @@ Registered = Annotated[
     Path | None,
     typer.Option(
         "--from",
-        help="File with a token to register, in place of a new one. Does nothing if it is registered.",
+        help="File with a token to register, in place of a new one. Does nothing if it is registered or was revoked.",
         metavar="FILE",
     ),
 ]
@@ -85,7 +85,8 @@ def create(
             text=None if source is None else source.read_text(encoding="utf-8").strip(),
         )
     if source is not None and not as_json:
-        err().print(f"Token {token.id} for {token.name} is registered.", markup=False)
+        state = "was revoked and stays so; put another one into the file" if token.revoked else "is registered"
+        err().print(f"Token {token.id} for {token.name} {state}.", markup=False)
         return
     if as_json:
         print_json({**shown(token), "token": text})
@@ -143,7 +144,9 @@ def revoke(ctx: typer.Context, id: TokenId, data: Data = None, as_json: Json = F
 
 def shown(token: Token) -> dict[str, Any]:
     """Return a token's record without its hash, for JSON output."""
-    return token.model_dump(mode="json", exclude={"sha256"}, exclude_none=True)
+    return token.model_dump(
+        mode="json", exclude={"sha256"} if token.revoked else {"sha256", "revoked"}, exclude_none=True
+    )
 
 
 def scopes_of(words: list[str]) -> list[Any]:

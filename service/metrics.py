@@ -43,8 +43,8 @@ class Metrics:
         )
         self.seconds = prometheus_client.Histogram(
             "pliant_http_answer_seconds",
-            "Seconds until an answer begins, by route.",
-            ["route"],
+            "Seconds until an answer begins, by method and route, without answers that waited for a job.",
+            ["method", "route"],
             buckets=ANSWER_SECONDS,
             registry=self.registry,
         )
@@ -52,10 +52,12 @@ class Metrics:
             "pliant_http_under_way", "Requests in progress, event streams included.", registry=self.registry
         )
 
-    def count(self, method: str, route: str, *, status: int, seconds: float) -> None:
-        """Count a response."""
-        self.answers.labels(method if method in METHODS else "other", route, str(status)).inc()
-        self.seconds.labels(route).observe(seconds)
+    def count(self, method: str, route: str, *, status: int, seconds: float | None) -> None:
+        """Count a response; `seconds` is None if the client asked it to wait."""
+        method = method if method in METHODS else "other"
+        self.answers.labels(method, route, str(status)).inc()
+        if seconds is not None:
+            self.seconds.labels(method, route).observe(seconds)
 
     def exposition(self, jobs: Jobs) -> bytes:
         """Return all metrics, for the jobs of all owners, in Prometheus' text format. Blocks; call it on a thread."""
@@ -151,23 +153,25 @@ class CountRequests:
             return
         begun, counted = self._clock(), False
 
-        def count(status: int) -> None:
+        def count(status: int, *, waited: bool) -> None:
             nonlocal counted
             if not counted:
                 counted = True
-                seconds = self._clock() - begun
+                seconds = None if waited else self._clock() - begun
                 self._metrics.count(scope["method"], _route(scope), status=status, seconds=seconds)
 
         async def watched(message: Message) -> None:
             if message["type"] == "http.response.start":
-                count(message["status"])
+                count(message["status"], waited=any(name == b"preference-applied" for name, _ in message["headers"]))
             await send(message)
 
         with self._metrics.active.track_inprogress():
             try:
                 await self._app(scope, receive, watched)
             except Exception:
-                count(500)  # the response to an unexpected exception is created outside of this middleware
+                count(
+                    500, waited=False
+                )  # the response to an unexpected exception is created outside of this middleware
                 raise
 
 

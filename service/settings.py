@@ -54,7 +54,7 @@ class ServiceSettings:
     """Seconds without an event after which an event stream sends a comment line."""
     allowed_hosts: Listed = ()
     """Accepted values of the Host header, separated by commas. Empty: the names of the loopback address if the service is
-    bound to it, else any."""
+    bound to it, else any. `/healthz`, `/readyz` and `/metrics` accept every host."""
     auth: Auth = "auto"
     """Whether a request needs a token: `required`, `off`, or `auto`, which is off on the loopback address and required on any
     other."""

@@ -68,6 +68,8 @@ class Token(BaseModel):
     max_running: int | None = None
     """Maximum number of running jobs; the others wait."""
     requests_per_minute: int | None = None
+    revoked: bool = False
+    """Whether it was revoked. Its record is kept without its hash, so that a deployment does not register it again."""
 
     def may(self, scope: Scope) -> bool:
         """Return whether the token has a scope."""
@@ -112,7 +114,7 @@ class Tokens:
         """Create a token; return its record, and the token itself, which is not stored and cannot be shown again.
 
         `expires` is the lifetime; None: unlimited. `sharing` is the id of a token whose jobs the new one shares, e.g. to replace
-        it. `text` is a token generated elsewhere, e.g. by a deployment; a known one is returned unchanged.
+        it. `text` is a token generated elsewhere, e.g. by a deployment; a known one is returned unchanged, a revoked one as revoked.
 
         Raises
         ------
@@ -153,19 +155,16 @@ class Tokens:
                 "invalid_token_text", field="from", expected=f"{PREFIX}, 12 hexadecimal digits, _, 43 letters or digits",
                 got=f"{len(text)} characters", hint="`pliant token create` without it generates a token.",
             )  # fmt: skip
-        return self.recognise(text)
+        held = self._record(text.removeprefix(PREFIX)[:12])
+        return held if held is not None and held.revoked else self.recognise(text)
 
     def recognise(self, text: str) -> Token | None:
         """Return the record of a token, expired or not; None if it is unknown or revoked."""
         form = _FORM.fullmatch(text)
         if form is None:
             return None
-        with reachable():
-            body = self._redis.hget(self._key, form[1])
-        if body is None:
-            return None
-        token = Token.model_validate_json(body)
-        return token if hmac.compare_digest(token.sha256, _digest(text)) else None
+        token = self._record(form[1])
+        return token if token is not None and hmac.compare_digest(token.sha256, _digest(text)) else None
 
     def get(self, id: str) -> Token:
         """Return a token's record.
@@ -173,19 +172,25 @@ class Tokens:
         Raises
         ------
         UnknownToken
-            No token has this id.
+            No token has this id, or it was revoked.
         """
+        token = self._record(id)
+        if token is None or token.revoked:
+            raise UnknownToken(id)
+        return token
+
+    def _record(self, id: str) -> Token | None:
+        """Return the record of a token, revoked or not; None if there is none."""
         with reachable():
             body = self._redis.hget(self._key, id)
-        if body is None:
-            raise UnknownToken(id)
-        return Token.model_validate_json(body)
+        return None if body is None else Token.model_validate_json(body)
 
     def all(self) -> list[Token]:
-        """Return every token's record, oldest first."""
+        """Return the record of every token that is not revoked, oldest first."""
         with reachable():
             bodies = self._redis.hvals(self._key)
-        return sorted(map(Token.model_validate_json, bodies), key=lambda token: (token.created_at, token.id))
+        tokens = [token for token in map(Token.model_validate_json, bodies) if not token.revoked]
+        return sorted(tokens, key=lambda token: (token.created_at, token.id))
 
     def usable(self) -> bool:
         """Return whether at least one token has not expired."""
@@ -193,16 +198,17 @@ class Tokens:
         return any(not token.expired(now) for token in self.all())
 
     def revoke(self, id: str) -> Token:
-        """Remove a token, effective from the next request on. Its jobs are kept.
+        """Revoke a token for ever, effective from the next request on. Its jobs are kept.
 
         Raises
         ------
         UnknownToken
-            No token has this id.
+            No token has this id, or it was revoked.
         """
         token = self.get(id)
+        spent = token.model_copy(update={"sha256": "", "scopes": (), "revoked": True})
         with reachable():
-            self._redis.hdel(self._key, id)
+            self._redis.hset(self._key, id, spent.model_dump_json())
         return token
 
 

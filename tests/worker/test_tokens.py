@@ -62,6 +62,21 @@ def test_a_revoked_token_is_unknown_at_once(tokens: Tokens) -> None:
     assert tokens.all() == []
     with pytest.raises(UnknownToken, match="pliant token list"):
         tokens.revoke(token.id)
+    with pytest.raises(UnknownToken):
+        tokens.create("x", sharing=token.id)
+
+
+def test_a_revoked_token_is_not_registered_again(tokens: Tokens) -> None:
+    """Otherwise each start of a deployment that registers its first token would undo the revocation."""
+    _, text = tokens.create("first", scopes=[Scope.ADMIN])
+    token, _ = tokens.create("first", scopes=[Scope.ADMIN], text=text)
+    assert token == tokens.recognise(text)
+    tokens.revoke(token.id)
+    again, _ = tokens.create("first", scopes=[Scope.ADMIN], text=text)
+    assert again.revoked
+    assert not again.may(Scope.READ)
+    assert tokens.recognise(text) is None
+    assert not tokens.usable()
 
 
 def test_a_token_expires_at_its_time_and_not_before(settings: Settings) -> None:

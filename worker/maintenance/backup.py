@@ -14,6 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import secrets
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -38,6 +39,9 @@ from pliant.worker.store.snapshot import Snapshot
 FORMAT = 1
 """Version of the layout of a backup's directory."""
 
+_OWN = re.compile(r"blobs|manifest\.json(\.new)?|jobs-[0-9a-f]{8}\.jsonl|rest-[0-9a-f]{8}\.json")
+"""Names in a backup's directory."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Summary:
@@ -53,7 +57,7 @@ class Summary:
 def write_backup(settings: Settings, target: Path) -> Summary:
     """Back up an installation, which may be running. An earlier backup in the directory is updated.
 
-    The earlier backup stays valid until the new manifest atomically replaces the old one.
+    The earlier backup stays valid until the new manifest atomically replaces the old one. A backup that was interrupted is continued.
 
     Raises
     ------
@@ -62,7 +66,7 @@ def write_backup(settings: Settings, target: Path) -> Summary:
     StoreUnavailable
         A store does not answer.
     """
-    if target.is_file() or (target.is_dir() and any(target.iterdir()) and not (target / "manifest.json").exists()):
+    if target.is_file() or (target.is_dir() and not all(_OWN.fullmatch(each.name) for each in target.iterdir())):
         raise BadBackup(f"{target} is not a backup. Choose an empty or new directory.")
     target.mkdir(parents=True, exist_ok=True, mode=0o700)
     snapshot, jobs = Snapshot(settings), Jobs.open(settings)

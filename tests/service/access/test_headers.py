@@ -89,7 +89,14 @@ def test_only_the_listed_hosts_are_accepted(serve: Serve) -> None:
         ("127.0.0.1", 421),
         ("x.pliant.example", 421),
     ):
-        assert httpx.get(f"{running.url}/healthz", headers={"Host": host}).status_code == status
+        assert httpx.get(f"{running.url}/v1/limits", headers={"Host": host}).status_code == status
+
+
+@pytest.mark.parametrize("path", ["/healthz", "/readyz", "/metrics"])
+def test_probes_and_monitoring_may_use_the_address_of_a_process(serve: Serve, path: str) -> None:
+    running = serve(allowed_hosts=("pliant.example",))
+    assert httpx.get(f"{running.url}{path}", headers={"Host": "10.42.0.17:8000"}).status_code != 421
+    assert httpx.get(f"{running.url}{path}/", headers={"Host": "10.42.0.17:8000"}).status_code == 421
 
 
 def test_any_host_is_accepted_off_loopback_without_a_host_list(serve: Serve) -> None:

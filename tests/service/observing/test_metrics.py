@@ -44,6 +44,7 @@ def test_metrics_count_jobs_and_requests(serve: Serve) -> None:
             failed.id, lambda held: lifecycle.fail(held, attempt_id=token, problem=problem, now=later, retention=0)
         )
         http.get(f"/v1/jobs/{waiting.id}")
+        http.get(f"/v1/jobs/{waiting.id}", headers={"Prefer": "wait=1"})
         http.get("/v1/jobs/nobody")
         http.get("/nowhere/at/all")
         answer = http.get("/metrics")
@@ -73,7 +74,7 @@ def test_metrics_count_jobs_and_requests(serve: Serve) -> None:
     assert at(now, "pliant_http_requests_total", method="POST", route="/v1/jobs", status="202") == 3
     assert at(now, "pliant_http_requests_total", method="GET", route="/v1/jobs/{id}", status="404") == 1
     assert at(now, "pliant_http_requests_total", method="GET", route="other", status="404") == 1
-    assert at(now, "pliant_http_answer_seconds_count", route="/v1/jobs/{id}") == 2
+    assert at(now, "pliant_http_answer_seconds_count", method="GET", route="/v1/jobs/{id}") == 2, "without the wait"
     assert at(now, "pliant_http_under_way") == 1, "this request itself"
     assert "nobody" not in answer.text, "addresses are strangers' text"
 

@@ -25,6 +25,7 @@ from pliant.worker.maintenance.fsck import findings
 from pliant.worker.records import Webhook
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
+from pliant.worker.store.snapshot import Snapshot
 from pliant.worker.tokens import Tokens
 
 NOW = datetime(2026, 5, 4, 9, 30, tzinfo=UTC)
@@ -180,6 +181,22 @@ def test_invalid_backups_and_targets_are_refused(jobs: Jobs, backup: Path, empty
         restore_backup(empty, tmp_path / "other")
     with pytest.raises(BadBackup, match="already has jobs or tokens"):
         restore_backup(jobs.settings, backup)
+
+
+def test_an_interrupted_first_backup_is_continued(
+    jobs: Jobs, sent: dict[str, str], empty: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "backup"
+    with monkeypatch.context() as broken:
+        broken.setattr(Snapshot, "rest", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            write_backup(jobs.settings, target)
+    assert not (target / "manifest.json").exists()
+    assert list(target.glob("jobs-*"))
+    summary = write_backup(jobs.settings, target)
+    assert (summary.jobs, summary.copied) == (len(sent), 0)
+    assert len(list(target.glob("jobs-*"))) == 1, "the remains are gone"
+    assert restore_backup(empty, target).jobs == len(sent)
 
 
 @pytest.mark.parametrize(
