@@ -30,6 +30,12 @@ EARLY = 0.05
 OUT_OF_STEP = frozenset({"upload_offset_mismatch", "upload_busy", "upload_taken_over", "upload_complete"})
 """Codes after which the client reads the upload's offset again and continues from there."""
 
+SUBMISSION = "the submission"
+"""Operation after whose timeout a repeated call could make a second job."""
+
+NOT_EXECUTED = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout, TooManyRequests)
+"""Errors after which the service has certainly not executed the call."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Retry:
@@ -84,6 +90,8 @@ class Attempts:
     """Name of the operation in the message of `WaitTimeout`."""
 
     failures: int = 0
+    uncertain: bool = False
+    """Whether the service may have executed a call whose answer was lost."""
     failing_since: float = field(default=math.nan)
     deadline: float = field(init=False)
 
@@ -105,10 +113,13 @@ class Attempts:
 
     def _passed(self) -> WaitTimeout:
         """Return the error for a deadline that passed while nothing failed."""
-        return WaitTimeout(
-            f"The timeout of {self.timeout:g} s passed during {self.doing}. "
-            "Nothing was cancelled; call again, or use a longer timeout."
-        )
+        advice = "Nothing was cancelled; call again, or use a longer timeout."
+        if self.doing == SUBMISSION:
+            advice = (
+                "The job may have been accepted: look for it in the list of jobs, or submit again with the same idempotency_key, "
+                "which never makes a second job."
+            )
+        return WaitTimeout(f"The timeout of {self.timeout:g} s passed during {self.doing}. {advice}")
 
     def bounding(self, on_bytes: OnBytes | None) -> OnBytes:
         """Return `on_bytes` as a callback that raises `WaitTimeout` once the deadline has passed, in the middle of a body."""
@@ -142,6 +153,7 @@ class Attempts:
             No attempt succeeded within the time that `retries` allows.
         """
         now = self.retries.clock()
+        self.uncertain = self.uncertain or not isinstance(fault, NOT_EXECUTED)
         if self.failures == 0 and isinstance(fault, httpx.TimeoutException) and now >= self.deadline - EARLY:
             raise self._passed() from fault  # every wait for the network ends at the deadline
         if self.failures == 0:
@@ -180,7 +192,7 @@ def may_repeat(call: Call, fault: Exception) -> bool:
     """
     if isinstance(fault, httpx.UnsupportedProtocol | httpx.LocalProtocolError):
         return False
-    if isinstance(fault, httpx.ConnectError | httpx.ConnectTimeout | httpx.PoolTimeout | TooManyRequests):
+    if isinstance(fault, NOT_EXECUTED):
         return True
     if not call.repeatable:
         return False

@@ -70,7 +70,8 @@ def create_app(
     `limits` bounds the inputs that the readers accept; None: the default limits, with `read_memory` from the jobs' settings.
     """
     metrics = Metrics()
-    limits = limits or Limits(read_memory=jobs_of_all.settings.read_memory)
+    memory = jobs_of_all.settings.read_memory
+    limits = limits or Limits(read_memory=memory, parse_memory=min(memory, Limits().parse_memory))
     app = FastAPI(
         title="Pliant",
         summary=openapi.SUMMARY,
@@ -83,7 +84,8 @@ def create_app(
         docs_url=None,  # FastAPI's page loads Swagger UI from a CDN, which the content-security policy forbids; see `page`
         redoc_url=None,
     )
-    problems.install(app, STATUS_OF, security_headers=SECURITY_HEADERS)
+    routes = [route for each in ROUTES for route in each.router.routes]
+    problems.install(app, STATUS_OF, routes=routes, security_headers=SECURITY_HEADERS)
     for each in ROUTES:
         app.include_router(each.router)
     mount_page(app)
@@ -128,9 +130,10 @@ def middleware(settings: ServiceSettings, tokens: Tokens, metrics: Metrics, reco
             Middleware(
                 CORSMiddleware,
                 allow_origins=settings.cors_origins,
-                allow_methods=["GET", "POST", "PUT", "PATCH", "DELETE"],
+                allow_methods=["GET", "HEAD", "POST", "PUT", "PATCH", "DELETE"],
                 allow_headers=[
                     *("Authorization", "Content-Type", "Idempotency-Key", "Last-Event-ID", "Prefer", "Range"),
+                    *("If-Match", "If-None-Match", "If-Range"),
                     REQUEST_ID_HEADER,
                     *("Repr-Digest", "Upload-Complete", "Upload-Length", "Upload-Offset"),
                 ],

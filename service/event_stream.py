@@ -67,7 +67,9 @@ class Followers:
         InvalidRequest
             `after` is not the id of an event.
         """
-        watcher = self._watchers.setdefault(id, _Watcher())
+        watcher = self._watchers.get(id)
+        if watcher is None or watcher.failure is not None:  # a client that reads nothing keeps a failed one alive
+            watcher = self._watchers[id] = _Watcher()
         watcher.listeners += 1
         try:
             self._start_reader(jobs.records)  # before the first read, so that no change falls between the two
@@ -88,8 +90,11 @@ class Followers:
                 if watcher.failure is not None:
                     raise watcher.failure
                 self._start_reader(jobs.records)  # it may have ended after a failure, just before this follower came
-                if not watcher.newer(last) and not await watcher.changed(heartbeat):
-                    yield None
+                if not watcher.newer(last):
+                    if watcher.ended:
+                        return  # the id `after` is that of no event yet
+                    if not await watcher.changed(heartbeat):
+                        yield None
                 known = watcher.newer(last)
         finally:
             watcher.listeners -= 1
@@ -177,6 +182,8 @@ class _Watcher:
     def __init__(self) -> None:
         self.listeners = 0
         self.failure: Exception | None = None
+        self.ended = False
+        """Whether the job's last event was read."""
         self.read_up_to: str | None = None
         """The last event that the reader has read."""
         self._events: deque[Event] = deque(maxlen=KEPT)
@@ -185,6 +192,7 @@ class _Watcher:
     def publish(self, events: list[Event]) -> None:
         """Add events and wake the followers."""
         self._events.extend(events)
+        self.ended = self.ended or any(map(is_final, events))
         self.wake()
 
     def fail(self, error: Exception) -> None:

@@ -23,6 +23,7 @@ from pliant.schemas.validation import expectation
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.routing import BaseRoute, Match, Route
 from starlette.types import Receive, Scope, Send
 
 MEDIA_TYPE = "application/problem+json"
@@ -141,14 +142,21 @@ def from_validation(errors: Sequence[Any], *, options: bool = False) -> Refusal:
     )  # fmt: skip
 
 
-def install(app: FastAPI, table: Mapping[type[Exception], int], *, security_headers: Mapping[str, str]) -> None:
+def install(
+    app: FastAPI,
+    table: Mapping[type[Exception], int],
+    *,
+    routes: Sequence[BaseRoute],
+    security_headers: Mapping[str, str],
+) -> None:
     """Answer every error of the app with a problem document.
 
-    `table` maps error classes to status codes; a subclass that is not listed uses its nearest base's. `security_headers` are for
-    the response to an unexpected exception, which is created outside all middleware.
+    `table` maps error classes to status codes; a subclass that is not listed uses its nearest base's. `routes` are those whose methods
+    the header `Allow` lists. `security_headers` are for the response to an unexpected exception, which is created outside all middleware.
     """
     app.add_exception_handler(Refusal, _of_refusal)
-    app.add_exception_handler(HTTPException, _of_http)
+    paths = [route for route in routes if isinstance(route, Route)]
+    app.add_exception_handler(HTTPException, partial(_of_http, routes=paths))
     app.add_exception_handler(RequestValidationError, _of_validation)
     app.add_exception_handler(ClientDisconnect, _of_disconnect)
     app.add_exception_handler(OSError, partial(_of_disk, security_headers=security_headers))
@@ -164,11 +172,16 @@ async def _of_refusal(_: Request, error: Exception) -> Response:
     )
 
 
-async def _of_http(_: Request, error: Exception) -> Response:
+async def _of_http(request: Request, error: Exception, *, routes: Sequence[Route]) -> Response:
     assert isinstance(error, HTTPException)
+    headers = dict(error.headers or {})
+    if error.status_code == 405:  # the router names the methods of only the first route with this path
+        matching = [route for route in routes if route.matches(request.scope)[0] is not Match.NONE]
+        if methods := {method for route in matching for method in route.methods or ()}:
+            headers["Allow"] = ", ".join(sorted(methods))
     usual = (ProblemCode.HTTP_ERROR, f"{error.detail}. See /docs.")
     code, detail = _BY_STATUS.get(error.status_code, usual)
-    return answer(code, detail=detail, status=error.status_code, headers=error.headers)
+    return answer(code, detail=detail, status=error.status_code, headers=headers)
 
 
 async def _of_validation(request: Request, error: Exception) -> Response:

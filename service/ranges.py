@@ -20,8 +20,10 @@ class Slice:
     length: int = 0
 
 
-def decide(headers: Mapping[str, str], *, size: int, etag: str) -> Slice:
+def decide(headers: Mapping[str, str], *, size: int, etag: str, ranges: bool = True) -> Slice:
     """Return status and bytes of the response to a GET with these headers; `etag` is the strong entity tag, with its quotes.
+
+    `ranges` is False for methods that do not know ranges, such as HEAD.
 
     Preconditions come first (If-Match, If-None-Match), then Range if If-Range matches. A request for several ranges gets the
     whole file, as RFC 9110 §14.2 allows, because resuming a download needs only one.
@@ -30,7 +32,7 @@ def decide(headers: Mapping[str, str], *, size: int, etag: str) -> Slice:
         return Slice(412)
     if "if-none-match" in headers and _matches(headers["if-none-match"], etag, strong=False):
         return Slice(304)
-    wanted = headers.get("range")
+    wanted = headers.get("range") if ranges else None
     # If-Range with a date never matches, because responses have no Last-Modified.
     if wanted is None or headers.get("if-range", etag).strip() != etag:
         return Slice(200, 0, size)

@@ -258,8 +258,8 @@ class Records(ABC):
         """Return up to `limit` records older than the cursor, newest first, and the next page's cursor, None on the last page."""
 
     @abstractmethod
-    def ids(self, status: Status) -> list[str]:
-        """Return every job id of one status, oldest first."""
+    def ids(self, *statuses: Status) -> list[str]:
+        """Return every job id of some statuses at one moment, one status after the other, each with the oldest first."""
 
     @abstractmethod
     def count(self, statuses: Sequence[Status], *, owner: str | None = None) -> int:

@@ -91,9 +91,9 @@ class AsyncRemoteJob:
         self.record = (await self._client.cancel(self.id, timeout=timeout)).record
         return self
 
-    async def retry(self, *, timeout: float | None = None) -> AsyncRemoteJob:
+    async def retry(self, *, idempotency_key: str | None = None, timeout: float | None = None) -> AsyncRemoteJob:
         """Queue and return a new job with the same inputs and options, after this one failed or was cancelled."""
-        return await self._client.retry(self.id, timeout=timeout)
+        return await self._client.retry(self.id, idempotency_key=idempotency_key, timeout=timeout)
 
     async def make_outputs(
         self,
@@ -110,10 +110,17 @@ class AsyncRemoteJob:
         )
 
     async def run_again(
-        self, options: Options | Mapping[str, Any] | None = None, *, name: str = "", timeout: float | None = None
+        self,
+        options: Options | Mapping[str, Any] | None = None,
+        *,
+        name: str = "",
+        idempotency_key: str | None = None,
+        timeout: float | None = None,
     ) -> AsyncRemoteJob:
         """Submit the same inputs with other options, without uploading them again; `name` defaults to this job's."""
-        return await self._client.submit(inputs_of=self.id, options=options, name=name, timeout=timeout)
+        return await self._client.submit(
+            inputs_of=self.id, options=options, name=name, idempotency_key=idempotency_key, timeout=timeout
+        )
 
     async def share(self, *, days: float = 7, timeout: float | None = None) -> Share:
         """Create a read-only link to the result: see `AsyncClient.share`."""

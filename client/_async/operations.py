@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import secrets
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import aclosing
@@ -21,6 +22,9 @@ from pliant.client.pauses import async_sleep, in_thread
 from pliant.client.result import job_path, unknown_file
 from pliant.schemas.job import Job
 from pliant.schemas.options import Options
+
+WAITED = re.compile(r"wait=0*[1-9]")
+"""`Preference-Applied` of a service that delays its answers."""
 
 OnJob = Callable[[Job], None]
 """Called with the job each time its record changes."""
@@ -89,7 +93,7 @@ async def wait(exchange: Exchange, job: str, *, on_progress: OnJob | None) -> Jo
         now = parse(Job, body, response.status_code)
         if now.status.final:
             return now
-        if "wait" not in response.headers.get("preference-applied", ""):
+        if not WAITED.search(response.headers.get("preference-applied", "")):
             exchange.attempts.remaining()
             await async_sleep(pause)
             pause = min(retries.poll_interval, 1.5 * pause)

@@ -28,6 +28,7 @@ from pliant.client.multipart import Inputs, OnBytes, option_fields
 from pliant.client.pauses import in_place
 from pliant.client.requests import further, sharing
 from pliant.client.result import finished, job_path, loaded, succeeded
+from pliant.client.retry import SUBMISSION
 from pliant.schemas.job import Interpretation, Job, JobPage, Priority, ServiceLimits, Status
 from pliant.schemas.options import Options, Output
 from pliant.schemas.shares import Share
@@ -139,7 +140,7 @@ class Client(Connection):
         )  # fmt: skip
         with tempfile.TemporaryDirectory(prefix="pliant-submit-") as folder:
             job = operations.submit(
-                self._exchange(timeout, "the submission"),
+                self._exchange(timeout, SUBMISSION),
                 inputs,
                 folder=Path(folder),
                 options=options,
@@ -337,11 +338,11 @@ class Client(Connection):
         call = Call(method="POST", path=f"{job_path(job)}/cancel", changes_nothing=True)
         return RemoteJob(self, self._exchange(timeout).record(call, Job))
 
-    def retry(self, job: str, *, timeout: float | None = None) -> RemoteJob:
-        """Queue and return a new job with the inputs and options of a failed or cancelled one."""
-        headers = {"Idempotency-Key": secrets.token_urlsafe(16)}
+    def retry(self, job: str, *, idempotency_key: str | None = None, timeout: float | None = None) -> RemoteJob:
+        """Queue and return a new job with the inputs and options of a failed or cancelled one; `idempotency_key` as in `submit`."""
+        headers = {"Idempotency-Key": idempotency_key or secrets.token_urlsafe(16)}
         call = Call(method="POST", path=f"{job_path(job)}/retry", headers=headers)
-        return RemoteJob(self, self._exchange(timeout).record(call, Job))
+        return RemoteJob(self, self._exchange(timeout, SUBMISSION).record(call, Job))
 
     def make_outputs(
         self,
@@ -449,7 +450,7 @@ class Client(Connection):
         try:
             exchange.answer(Call(method="DELETE", path=path))
         except NotFound:
-            if exchange.attempts.failures == 0:  # otherwise an earlier attempt removed it, and the response was lost
+            if not exchange.attempts.uncertain:  # otherwise an earlier attempt removed it, and the response was lost
                 raise
 
     def _document(self, path: str, timeout: float | None) -> Any:

@@ -92,9 +92,9 @@ class RemoteJob:
         self.record = (self._client.cancel(self.id, timeout=timeout)).record
         return self
 
-    def retry(self, *, timeout: float | None = None) -> RemoteJob:
+    def retry(self, *, idempotency_key: str | None = None, timeout: float | None = None) -> RemoteJob:
         """Queue and return a new job with the same inputs and options, after this one failed or was cancelled."""
-        return self._client.retry(self.id, timeout=timeout)
+        return self._client.retry(self.id, idempotency_key=idempotency_key, timeout=timeout)
 
     def make_outputs(
         self,
@@ -111,10 +111,17 @@ class RemoteJob:
         )
 
     def run_again(
-        self, options: Options | Mapping[str, Any] | None = None, *, name: str = "", timeout: float | None = None
+        self,
+        options: Options | Mapping[str, Any] | None = None,
+        *,
+        name: str = "",
+        idempotency_key: str | None = None,
+        timeout: float | None = None,
     ) -> RemoteJob:
         """Submit the same inputs with other options, without uploading them again; `name` defaults to this job's."""
-        return self._client.submit(inputs_of=self.id, options=options, name=name, timeout=timeout)
+        return self._client.submit(
+            inputs_of=self.id, options=options, name=name, idempotency_key=idempotency_key, timeout=timeout
+        )
 
     def share(self, *, days: float = 7, timeout: float | None = None) -> Share:
         """Create a read-only link to the result: see `Client.share`."""

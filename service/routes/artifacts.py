@@ -62,7 +62,7 @@ def artifact(id: Id, name: Name, request: Request, jobs: Mine, core: Core, redir
     about, blob = _open(jobs, id, name)
     size = blob.size
     etag = f'"{about.sha256}"'
-    part = decide(request.headers, size=size, etag=etag)
+    part = decide(request.headers, size=size, etag=etag, ranges=request.method == "GET")
     headers = {
         "ETag": etag,
         "Accept-Ranges": "bytes",

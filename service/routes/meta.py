@@ -41,12 +41,14 @@ def limits(core: Core, bounds: Bound) -> ServiceLimits:
     )
 
 
+@router.head("/healthz", include_in_schema=False)
 @router.get("/healthz", operation_id="get_health", summary="Liveness: the process answers")
 async def healthz() -> dict[str, str]:
     """Return 200 while the process responds. It checks nothing else and does not wait for a thread."""
     return {"status": "ok"}
 
 
+@router.head("/readyz", include_in_schema=False)
 @router.get(
     "/readyz", operation_id="get_readiness", summary="Readiness: all parts answer", responses=problems(422, 503)
 )

@@ -24,7 +24,7 @@ from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Bound, Bounds, Core, MyUploads, Service, bounds_of
 from pliant.service.multipart import batches
 from pliant.service.openapi import problems
-from pliant.service.problems import refused, wrong_input
+from pliant.service.problems import Refusal, refused, wrong_input
 from pliant.worker.errors import OffsetMismatch
 from pliant.worker.uploads.service import Uploads
 from pliant.worker.uploads.writer import Capacity, Writer
@@ -98,6 +98,9 @@ async def put(
     After an interruption, get the offset with HEAD and send the rest with `Upload-Offset`. Only a complete upload can be used.
     It is removed one day after its last byte or last use, unless the operator chose another period.
     """
+    if "content-range" in request.headers:  # as `curl -C` sends it; the body would replace what is there
+        detail = "An upload is not resumed with Content-Range. Send the rest with Upload-Offset, the offset that HEAD returns."
+        raise Refusal(ProblemCode.BAD_REQUEST, detail=detail, field="Content-Range")
     sending = Sending.of(request, offset=offset or 0, complete=complete, length=length, digest=digest)
     there = await _find_complete(uploads, id, sending)
     response.status_code = 200 if there is not None or sending.offset > 0 else 201
@@ -129,7 +132,12 @@ async def patch(
     length: Length = None,
     digest: Digest = None,
 ) -> Upload:
-    """Append at `Upload-Offset`, as the IETF draft specifies. `PUT` with that header does the same."""
+    """Append at `Upload-Offset`, as the IETF draft specifies. `PUT` with that header does the same, but begins again at 0."""
+    if offset == 0:  # `PUT` would discard what is there, or begin an upload
+        there = await to_thread.run_sync(uploads.get, id)
+        if there.offset > 0 and not there.complete:
+            raise _mismatch(OffsetMismatch(id, expected=there.offset, got=0))
+        length = there.length if length is None else length
     there = await put(id, request, response, core, bounds, uploads, offset, complete, length, digest)
     response.status_code = 200
     return there
@@ -201,8 +209,7 @@ async def _receive(request: Request, core: Service, *, uploads: Uploads, id: str
     try:
         writer: Writer = await to_thread.run_sync(held.__enter__)
     except OffsetMismatch as error:
-        headers = {"Upload-Offset": error.expected, "Upload-Complete": "?0"}
-        raise refused(error, type=MISMATCH, headers=headers) from error
+        raise _mismatch(error) from error
     try:
         # The writer enforces the limit, over all requests together.
         async for batch in batches(request, max_bytes=ANY, stall_seconds=core.settings.stall_seconds):
@@ -212,6 +219,10 @@ async def _receive(request: Request, core: Service, *, uploads: Uploads, id: str
     finally:
         with anyio.CancelScope(shield=True):  # a request that a newer one stops must still release the lock
             await to_thread.run_sync(held.__exit__, None, None, None)
+
+
+def _mismatch(error: OffsetMismatch) -> Refusal:
+    return refused(error, type=MISMATCH, headers={"Upload-Offset": error.expected, "Upload-Complete": "?0"})
 
 
 def _capacity(core: Service, bounds: Bounds) -> Capacity:

@@ -128,8 +128,10 @@ def test_systemd_units_start_existing_commands(unit: Path) -> None:
     parser.read(unit)
     command = parser["Service"]["ExecStart"].split()
     assert starts(["pliant", *command[1:]])
-    used = set(re.findall(r"(PLIANT_[A-Z_]+)=", parser["Service"]["Environment"]))
-    assert used <= read_variables()
+    used = dict(re.findall(r"(PLIANT_[A-Z_]+)=(\S+)", parser["Service"]["Environment"]))
+    assert set(used) <= read_variables()
+    assert used["PLIANT_DATA"] == f"/var/lib/{parser['Service']['StateDirectory']}"
+    assert used["PLIANT_DATA"].endswith("/%i") is ("@" in unit.name), "instances must not share working files"
 
 
 def test_no_port_is_public_and_no_secret_has_a_default() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +142,39 @@ def test_workers_have_time_to_drain_before_termination(objects: list[dict[str, A
     assert pod["terminationGracePeriodSeconds"] > int(grace) + 20
 
 
+def test_uploads_are_on_the_volume_that_all_pods_share() -> None:
+    for each in containers(rendered({})):
+        held = {mount["mountPath"]: mount for mount in each["volumeMounts"]}
+        if each["name"] != "valkey":
+            assert held["/data/uploads"] == {"name": "shared", "mountPath": "/data/uploads", "subPath": "uploads"}
+    assert "subPath" not in str(containers(rendered(S3)))
+
+
+def test_the_inputs_that_the_api_reads_at_once_fit_its_memory() -> None:
+    (api,) = (each for each in containers(rendered({})) if each["name"] == "api")
+    env = {each["name"]: each.get("value") for each in api["env"]}
+    assert api["resources"]["limits"]["memory"] == "4Gi"
+    assert int(env["PLIANT_PARSERS"]) * int(env["PLIANT_READ_MEMORY"]) + 2**30 <= 4 * 2**30
+
+
+def test_valkey_replaces_its_shell_and_reads_the_password_from_its_input(tmp_path: Path) -> None:
+    (valkey,) = (each for each in containers(rendered({})) if each["name"] == "valkey")
+    server = tmp_path / "valkey-server"
+    server.write_text('#!/bin/sh\necho "$$" "$@"\ncat\n')
+    server.chmod(0o700)
+    env = {"PATH": f"{tmp_path}:{os.defpath}", "REDISCLI_AUTH": "secret"}
+    with subprocess.Popen(valkey["command"], env=env, stdout=subprocess.PIPE, text=True) as started:
+        told = started.communicate(timeout=20)[0].splitlines()
+    arguments, *configuration = told
+    assert arguments.split()[:2] == [str(started.pid), "-"], "the process that receives SIGTERM"
+    assert configuration == ["requirepass secret"]
+    assert "secret" not in arguments
+    assert "--appendfsync always" in arguments
+    bound = int(re.findall(r"--maxmemory (\d+)mb", arguments)[0])
+    assert valkey["resources"]["limits"]["memory"] == "1Gi"
+    assert 0.5 < bound / 1024 < 0.75
+
+
 def test_workers_are_scaled_by_queued_and_running_jobs() -> None:
     objects = rendered(EVERYTHING)
     (scaled,) = of(objects, "ScaledObject").values()
@@ -148,6 +182,7 @@ def test_workers_are_scaled_by_queued_and_running_jobs() -> None:
     (trigger,) = scaled["spec"]["triggers"]
     query = trigger["metadata"]["query"]
     assert (trigger["type"], trigger["metadata"]["threshold"]) == ("prometheus", "1")
+    assert trigger["metadata"]["ignoreNullValues"] == "false", "without metrics, the workers stay as they are"
     assert re.search(r'pliant_jobs\{namespace="ns", status=~"queued\|running\|cancelling"\}', query)
     assert "pliant_queue_depth" not in query, "the queue is empty while jobs run, which would end them"
     assert of(rendered({}), "ScaledObject") == {}
@@ -168,6 +203,7 @@ def test_the_generated_token_and_redis_url_are_well_formed(tmp_path: Path) -> No
         ({"storage": {"type": "s3"}}, "storage.s3.url"),
         ({"storage": {"type": "nfs"}}, "storage"),
         ({"settings": {"RETENTION": "1"}}, "'RETENTION' does not match"),
+        ({"valkey": {"maxmemory": "60%"}}, "'60%' does not match"),
         ({"api": {"replicas": 2}, "storage": {"pvc": {"accessMode": "ReadWriteOnce"}}}, "ReadWriteMany"),
     ],
 )

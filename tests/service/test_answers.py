@@ -138,6 +138,23 @@ def test_framework_errors_are_problem_documents(
     assert answer.headers["content-type"] == "application/problem+json"
 
 
+def test_allow_names_every_method_of_an_address(http: httpx.Client) -> None:
+    def allowed(method: str, path: str) -> str:
+        answer = http.request(method, path)
+        assert answer.status_code == 405
+        return answer.headers["allow"]
+
+    assert allowed("PATCH", "/v1/jobs/abc") == "DELETE, GET, PUT"
+    assert allowed("OPTIONS", "/v1/jobs") == "GET, POST"
+    assert allowed("POST", "/v1/jobs/abc/artifacts/shapes.npz") == "GET, HEAD"
+
+
+@pytest.mark.parametrize("path", ["/healthz", "/readyz?exclude=workers"])
+def test_health_checks_answer_head(http: httpx.Client, path: str) -> None:
+    answer = http.head(path)
+    assert (answer.status_code, answer.content) == (200, b"")
+
+
 @pytest.mark.parametrize(
     ("headers", "status"),
     [
@@ -159,6 +176,9 @@ def test_an_allowed_origin_passes_the_origin_check(serve: Serve) -> None:
     headers = {"Origin": "https://good.example"}
     answer = httpx.post(f"{running.url}/v1/jobs", content=b"x", headers=headers)
     assert (answer.status_code, answer.headers["access-control-allow-origin"]) == (415, "https://good.example")
+    for method, wanted in (("HEAD", "authorization"), ("GET", "if-range, if-none-match, if-match, range")):
+        asked = {"Access-Control-Request-Method": method, "Access-Control-Request-Headers": wanted}
+        assert httpx.options(f"{running.url}/v1/uploads/x", headers=headers | asked).status_code == 200
 
 
 def test_requests_return_503_if_the_store_is_unreachable(serve: Serve, tmp_path: Path) -> None:

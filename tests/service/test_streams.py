@@ -19,6 +19,7 @@ from typing import cast
 
 import httpx
 import pytest
+from pliant.schemas.job import Status
 from pliant.service import event_stream
 from pliant.service.event_stream import WOKEN_AT_ONCE, Followers, _Watcher, is_final
 from pliant.worker.errors import StoreUnavailable
@@ -123,6 +124,28 @@ def test_a_follower_that_comes_while_the_reader_fails_still_gets_events(
     assert is_final(last)
 
 
+def test_a_client_that_reads_nothing_keeps_no_failure_alive(
+    running: Running, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = submit(http, name="stalled")
+
+    async def followed() -> Status:
+        followers = Followers()
+        async with aclosing(followers.follow(running.jobs, job.id)) as stalled:
+            await anext(stalled)
+            with monkeypatch.context() as away:
+                away.setattr(running.jobs.records, "changes", lambda: (_ for _ in ()).throw(StoreUnavailable("away")))
+                followers._stop_reader()
+                followers._start_reader(running.jobs.records)
+                async with asyncio.timeout(15):
+                    while followers._watchers[job.id].failure is None:
+                        await asyncio.sleep(0.01)
+            await asyncio.to_thread(finish, running, job.id, b"result")
+            return (await followers.wait(running.jobs, job.id, 15)).status
+
+    assert asyncio.run(followed()) is Status.SUCCEEDED
+
+
 def test_followers_are_removed_when_their_client_disconnects(restless: Running) -> None:
     service = restless.app.state.service
     with httpx.Client(base_url=restless.url, timeout=10) as http:
@@ -216,7 +239,18 @@ def test_resuming_after_the_final_event_returns_no_events(running: Running, http
     assert (again.status_code, "id:" in again.text) == (200, False)
 
 
-@pytest.mark.parametrize("id", ["99999999999999999999-0", "0-18446744073709551616", "x", "1-"])
+def test_a_stream_after_an_id_of_the_future_ends_with_the_job(running: Running, http: httpx.Client) -> None:
+    job = submit(http, name="early")
+    headers = {"Last-Event-ID": "18446744073709551615-0"}
+    with http.stream("GET", f"/v1/jobs/{job.id}/events", headers=headers, timeout=15) as answer:
+        until(lambda: running.app.state.service.followers.watched == 1)
+        finish(running, job.id, b"result")
+        assert "id:" not in "".join(answer.iter_text())
+
+
+@pytest.mark.parametrize(
+    "id", ["99999999999999999999-0", "0-18446744073709551616", "18446744073709551615-18446744073709551615", "x", "1-"]
+)
 def test_an_invalid_event_id_is_rejected(http: httpx.Client, id: str) -> None:
     job = submit(http, name="impossible")
     answer = http.get(f"/v1/jobs/{job.id}/events", headers={"Last-Event-ID": id}, timeout=5)

@@ -69,6 +69,28 @@ def test_an_upload_can_span_several_requests(http: httpx.Client, verb: str) -> N
     assert (whole["complete"], whole["sha256"]) == (True, hashlib.sha256(DATA).hexdigest())
 
 
+def test_patch_at_0_discards_and_creates_nothing(http: httpx.Client) -> None:
+    again = {"Upload-Offset": "0", "Upload-Complete": "?0"}
+    assert http.patch("/v1/uploads/unknown", content=b"x", headers=again).status_code == 404
+    http.put("/v1/uploads/held", content=b"0123456789", headers={"Upload-Complete": "?0", "Upload-Length": "20"})
+    answer = http.patch("/v1/uploads/held", content=b"x", headers=again)
+    assert (answer.status_code, answer.json()["code"]) == (409, "upload_offset_mismatch")
+    assert answer.headers["upload-offset"] == "10"
+    assert http.get("/v1/uploads/held").json()["offset"] == 10
+    http.put("/v1/uploads/empty", content=b"", headers={"Upload-Complete": "?0", "Upload-Length": "3"})
+    more = http.patch("/v1/uploads/empty", content=b"xy", headers=again).json()
+    assert (more["offset"], more["length"]) == (2, 3)
+
+
+def test_put_with_content_range_is_refused_and_keeps_what_is_there(http: httpx.Client) -> None:
+    """`curl -C` resumes like this; its body is only the rest."""
+    http.put("/v1/uploads/half", content=b"01234", headers={"Upload-Complete": "?0"})
+    answer = http.put("/v1/uploads/half", content=b"56789", headers={"Content-Range": "bytes 5-9/10"})
+    assert (answer.status_code, answer.json()["field"]) == (400, "Content-Range")
+    assert "Upload-Offset" in answer.json()["detail"]
+    assert http.get("/v1/uploads/half").json()["offset"] == 5
+
+
 def test_a_broken_connection_keeps_the_received_bytes(running: Running, http: httpx.Client) -> None:
     path = "/v1/uploads/broken"
     connection = begun(running.url, path, declared=len(DATA), sent=DATA[:2_000_000])

@@ -39,7 +39,8 @@ def check_page(cursor: str | None, limit: int) -> None:
 
 def check_event_id(after: str) -> None:
     """Check that a text is the id of an event: two 64-bit numbers joined by a dash."""
-    if not _EVENT.fullmatch(after) or any(int(part) > _LARGEST_EVENT for part in after.split("-")):
+    parts = [int(part) for part in after.split("-")] if _EVENT.fullmatch(after) else []
+    if not parts or max(parts) > _LARGEST_EVENT or min(parts) == _LARGEST_EVENT:  # nothing can follow the largest id
         raise InvalidRequest(
             "invalid_event_id", field="Last-Event-ID", expected="the id of an event", got=repr(after)[:80],
             hint="Omit it to get all events that are kept.",

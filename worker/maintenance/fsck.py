@@ -47,13 +47,12 @@ def _look(jobs: Jobs) -> Iterator[str]:
 
 
 def _all(jobs: Jobs) -> Iterator[Stored]:
-    for status in Status:
-        for id in jobs.records.ids(status):
-            try:
-                stored = jobs.records.get(id)
-            except UnknownJob:
-                continue
-            yield stored
+    for id in jobs.records.ids(*Status):
+        try:
+            stored = jobs.records.get(id)
+        except UnknownJob:
+            continue
+        yield stored
 
 
 def _of_record(stored: Stored, sizes: dict[str, int]) -> Iterator[str]:

@@ -106,7 +106,7 @@ class Reconciler:
 
     def _take_from_lost_workers(self, gap: float) -> None:
         records, settings = self.jobs.records, self.jobs.settings
-        beats = records.beats([*records.ids(Status.RUNNING), *records.ids(Status.CANCELLING)])
+        beats = records.beats(records.ids(Status.RUNNING, Status.CANCELLING))
         for id, still in self._running.look(dict(beats), gap).items():
             if still < settings.lost_after:
                 continue
@@ -168,7 +168,7 @@ class Reconciler:
         if usual == 0 and all(beat.max_running is None for beat in absent.values()):
             return set()
         records = self.jobs.records
-        active = records.beats([*records.ids(Status.RUNNING), *records.ids(Status.CANCELLING)])
+        active = records.beats(records.ids(Status.RUNNING, Status.CANCELLING))
         taken = Counter(beat.owner for beat in active.values())
         taken.update(beat.owner for id, beat in queued.items() if id not in absent)
         held: set[str] = set()

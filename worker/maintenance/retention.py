@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import timedelta
 
-from pliant.worker.errors import UnknownJob
+from pliant.worker.errors import NotAllowedNow, UnknownJob
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.validation import LARGEST_PAGE
@@ -84,7 +84,10 @@ class Retention:
             page = self.jobs.page(cursor=cursor, limit=LARGEST_PAGE, statuses=lifecycle.FINAL)
             for job in page.jobs:
                 if job.expires_at is not None and job.expires_at <= now:
-                    with suppress(UnknownJob):
+                    # A client may have deleted it meanwhile and submitted another one under its id.
+                    with suppress(UnknownJob, NotAllowedNow):
+                        if self.jobs.get(job.id).created_at != job.created_at:
+                            continue
                         self.jobs.delete(job.id)
                         logger.info("job %s: expired and removed", job.id)
             cursor = page.next

@@ -107,9 +107,10 @@ class MemoryRecords(Records):
         page = fitting[:limit]
         return page, page[-1].sort_key if len(fitting) > limit else None
 
-    def ids(self, status: Status) -> list[str]:
+    def ids(self, *statuses: Status) -> list[str]:
         with self._lock:
-            fitting = sorted(each.sort_key for each in self._records.values() if each.job.status is status)
+            held = [(each.job.status, each.sort_key) for each in self._records.values()]
+        fitting = [key for status in statuses for key in sorted(key for own, key in held if own is status)]
         return [key.split(":", 1)[1] for key in fitting]
 
     def count(self, statuses: Sequence[Status], *, owner: str | None = None) -> int:

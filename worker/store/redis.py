@@ -211,10 +211,13 @@ class RedisRecords(Records):
         page = [Stored.model_validate_json(body) for body in bodies if body is not None]
         return page, keys[limit - 1] if len(keys) > limit else None
 
-    def ids(self, status: Status) -> list[str]:
+    def ids(self, *statuses: Status) -> list[str]:
         with reachable():
-            keys = self._redis.zrange(self._index(None, status), 0, -1)
-        return [key.split(":", 1)[1] for key in keys]
+            pipe = self._redis.pipeline(transaction=True)
+            for status in statuses:
+                pipe.zrange(self._index(None, status), 0, -1)
+            found = pipe.execute()
+        return [key.split(":", 1)[1] for keys in found for key in keys]
 
     def count(self, statuses: Sequence[Status], *, owner: str | None = None) -> int:
         with reachable():

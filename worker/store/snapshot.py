@@ -34,12 +34,14 @@ class Snapshot:
         self._read = client.register_script(_READ)
 
     def jobs(self) -> Iterator[dict[str, Any]]:
-        """Yield every job: its record, its log and its undelivered webhook."""
-        for status in Status:
-            for id in self._records.ids(status):
-                found = self.job(id)
-                if found is not None:
-                    yield found
+        """Yield every job that exists throughout once: its record, its log and its undelivered webhook.
+
+        Their ids are read at one moment, since jobs change their status while the caller copies files.
+        """
+        for id in self._records.ids(*Status):
+            found = self.job(id)
+            if found is not None:
+                yield found
 
     def job(self, id: str) -> dict[str, Any] | None:
         """Return one job, None if it does not exist."""

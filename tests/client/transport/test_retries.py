@@ -24,7 +24,7 @@ from pliant.client import (
 )
 from pliant.client.call import Call
 from pliant.client.errors import seconds_of
-from pliant.schemas.job import Job
+from pliant.schemas.job import Job, Status
 from pliant.service.testing import InMemoryService
 
 POINTS = np.random.default_rng(0).normal(size=(4, 9, 2))
@@ -250,6 +250,52 @@ def test_a_deletion_with_a_lost_response_succeeds(clock: Clock) -> None:
     service.faults, service.after = [cut_off], True
     job.delete()
     assert list(client.list()) == []
+
+
+@pytest.mark.parametrize("fault", [no_connection, answer(429)], ids=["no connection", "429"])
+def test_an_unknown_job_is_reported_if_no_attempt_can_have_deleted_it(
+    clock: Clock, fault: Callable[[httpx.Request], httpx.Response]
+) -> None:
+    with pytest.raises(NotFound):
+        client_of(Flaky(fault), clock).delete("no-such-job")
+
+
+def test_a_submission_that_times_out_may_have_been_accepted(clock: Clock) -> None:
+    def late(request: httpx.Request) -> httpx.Response:
+        clock.now += request.extensions["timeout"]["read"]
+        raise httpx.ReadTimeout("timed out", request=request)
+
+    service = Flaky(late, after=True)
+    client = client_of(service, clock)
+    with pytest.raises(WaitTimeout, match=r"may have been accepted.*idempotency_key"):
+        client.submit(POINTS, timeout=3, idempotency_key="once")
+    job = client.submit(POINTS, idempotency_key="once")
+    assert [other.id for other in client.list()] == [job.id]
+    job.wait(timeout=9)
+    again = job.run_again(idempotency_key="more")
+    assert job.run_again(idempotency_key="more").id == again.id != job.id
+
+
+def test_a_retried_job_is_one_job_for_one_key(clock: Clock) -> None:
+    with client_of(Flaky(steps=math.inf), clock) as client:
+        job = queued(client)
+        job.cancel()
+        assert job.retry(idempotency_key="again").id == client.retry(job.id, idempotency_key="again").id != job.id
+
+
+def test_a_service_that_grants_no_wait_is_polled(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pliant.client._sync.operations.sleep", clock.sleep)
+    service = Flaky()
+    client = client_of(service, clock)
+    job = client.submit(POINTS)
+    job.wait(timeout=9)
+    running = job.record.model_copy(update={"status": Status.RUNNING}).model_dump_json()
+    granted = {"content-type": "application/json", "preference-applied": "wait=0"}
+    service.faults = [lambda _: httpx.Response(200, text=running, headers=granted)] * 5
+    clock.pauses.clear()
+    assert client.wait(job.id, timeout=60).job.status is Status.SUCCEEDED
+    assert len(clock.pauses) == 5
+    assert min(clock.pauses) > 0.1
 
 
 def test_a_revocation_with_a_lost_response_succeeds(clock: Clock) -> None:

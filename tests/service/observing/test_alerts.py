@@ -92,8 +92,11 @@ def test_killed_processes_fire_their_alerts(serve: Serve, tmp_path: Path, monkey
             for name in running.jobs.queue.workers():  # its heartbeat expires within 20 s
                 running.jobs.queue._redis.pexpire(f"{running.jobs.settings.queue}:worker:{name}", 1)  # type: ignore[attr-defined]
             until_(lambda: not running.jobs.queue.workers(), seconds=60)
+            assert observer.look(5) == {"PliantWorkersLost"}, "no job waits"
+            waiting = long_job(http)
             assert "PliantNoWorker" not in observer.look(), "it may be restarted within a minute"
             assert observer.look(4) == {"PliantNoWorker", "PliantWorkersLost"}
+            assert http.post(f"/v1/jobs/{waiting}/cancel").is_success
         with worker(running, tmp_path / "log"):
             assert observer.look() == {"PliantWorkersLost"}, "half an hour looks back"
             assert observer.look(31, every=60.0) == set()
@@ -117,20 +120,35 @@ def test_an_unreachable_store_fires_its_alert(serve: Serve) -> None:
         assert "PliantStoreDown" in observer.look(5)
 
 
-def test_load_dependent_alerts_fire_on_synthetic_metrics() -> None:
+@pytest.mark.parametrize(
+    ("slow", "depth", "load"),
+    [("GET", 1, {"PliantSlow", "PliantQueueStuck"}), ("PUT", 0, set())],
+    ids=["load", "uploads"],
+)
+def test_load_dependent_alerts_fire_on_synthetic_metrics(slow: str, depth: int, load: set[str]) -> None:
     prometheus = Prometheus()
     told = (
         'pliant_http_requests_total{{status="200"}} {ok}\npliant_http_requests_total{{status="503"}} {failed}\n'
-        'pliant_http_answer_seconds_bucket{{route="/v1/jobs/{{id}}",le="1.0"}} {fast}\n'
-        'pliant_http_answer_seconds_bucket{{route="/v1/jobs/{{id}}",le="2.5"}} {ok}\n'
-        'pliant_http_answer_seconds_bucket{{route="/v1/jobs/{{id}}",le="+Inf"}} {ok}\n'
-        'pliant_webhooks_total{{result="given_up"}} {given_up}\npliant_queue_oldest_seconds {age}\n'
+        'pliant_http_answer_seconds_bucket{{method="{slow}",route="/v1/jobs/{{id}}",le="1.0"}} {fast}\n'
+        'pliant_http_answer_seconds_bucket{{method="{slow}",route="/v1/jobs/{{id}}",le="2.5"}} {ok}\n'
+        'pliant_http_answer_seconds_bucket{{method="{slow}",route="/v1/jobs/{{id}}",le="+Inf"}} {ok}\n'
+        'pliant_webhooks_total{{result="given_up"}} {given_up}\npliant_store_up 1\n'
+        "pliant_queue_oldest_seconds {age}\npliant_queue_depth {depth}\n"
     )
     for step in range(50):
         now = {"ok": 100 * step, "failed": 10 * step, "fast": 90 * step, "given_up": step // 40, "age": 60 * step}
-        prometheus.scrape(told.format(**now), at=EVERY * step)
+        prometheus.scrape(told.format(**now, slow=slow, depth=depth), at=EVERY * step)
         firing = prometheus.firing(RULES)
-    assert firing == {"PliantErrors", "PliantSlow", "PliantWebhooksFail", "PliantQueueStuck"}
+    assert firing == {"PliantErrors", "PliantWebhooksFail", *load}
+
+
+def test_missing_metrics_fire_their_alert() -> None:
+    prometheus = Prometheus()
+    firing = []
+    for step in range(20):
+        prometheus.scrape("pliant_store_up 1\n" if step < 10 else "", at=EVERY * step)
+        firing.append(prometheus.firing(RULES))
+    assert firing == [set()] * 18 + [{"PliantNotScraped"}] * 2
 
 
 def test_the_rule_evaluator_follows_prometheus_semantics() -> None:
@@ -143,6 +161,9 @@ def test_the_rule_evaluator_follows_prometheus_semantics() -> None:
     assert prometheus.query('rate(c_total{k!~"a|x"}[1m])') == {b: 2 / 60}
     assert prometheus.query("sum(c_total) / sum(c_total) * 2") == {frozenset(): 2.0}
     assert prometheus.query("max by (k) (c_total) >= 4") == {b: 4.0}
+    assert prometheus.query("c_total and on() sum(c_total) > 4") == {a: 1.0, b: 4.0}
+    assert prometheus.query("c_total and on() sum(c_total) > 5") == prometheus.query("absent(c_total)") == {}
+    assert prometheus.query("absent(d_total)") == {frozenset(): 1.0}
     assert binary("==", {a: 1.0, b: 2.0}, {a: 1.0}) == {a: 1.0}
     buckets = {frozenset({("le", le)}): n for le, n in (("1", 5.0), ("2", 10.0), ("+Inf", 10.0))}
     assert quantile(0.75, buckets) == {frozenset(): 1.5}

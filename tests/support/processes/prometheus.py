@@ -79,7 +79,11 @@ class Prometheus:
         if isinstance(node, promql.Call):
             return self._call(node)
         assert isinstance(node, promql.BinaryExpr), f"not evaluated: {type(node).__name__}"
-        return binary(str(node.op), self._value(node.lhs), self._value(node.rhs))
+        left, right = self._value(node.lhs), self._value(node.rhs)
+        if str(node.op) == "and":
+            assert str(node.modifier).strip() == "on ()", f"not evaluated: and {node.modifier}"
+            return left if right else {}
+        return binary(str(node.op), left, right)
 
     def _aggregate(self, node: Any) -> Vector:
         groups: dict[Labels, list[float]] = defaultdict(list)
@@ -96,6 +100,8 @@ class Prometheus:
             buckets = self._value(node.args[1])
             assert isinstance(buckets, dict)
             return quantile(float(node.args[0].val), buckets)
+        if name == "absent":
+            return {} if self._value(node.args[0]) else {frozenset(): 1.0}
         assert name in ("rate", "increase"), f"not evaluated: {name}"
         selector, window = node.args[0].vector_selector, node.args[0].range.total_seconds()
         end = self.scrapes[-1][0]

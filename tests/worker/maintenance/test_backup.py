@@ -13,7 +13,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from pliant.schemas.job import Artifact, Job, Status
+from pliant.schemas.job import Artifact, Job, Problem, Status
 from pliant.schemas.outputs import OutputRequest
 from pliant.worker.errors import BadBackup, NewerData
 from pliant.worker.jobs import lifecycle
@@ -181,6 +181,22 @@ def test_invalid_backups_and_targets_are_refused(jobs: Jobs, backup: Path, empty
         restore_backup(empty, tmp_path / "other")
     with pytest.raises(BadBackup, match="already has jobs or tokens"):
         restore_backup(jobs.settings, backup)
+
+
+def test_a_job_that_changes_during_a_backup_appears_once(jobs: Jobs, sent: dict[str, str]) -> None:
+    """Files are copied between two records, which takes minutes."""
+    listed = Snapshot(jobs.settings).jobs()
+    first = next(listed)["record"]["job"]["id"]
+    assert first == sent["queued"]
+    jobs.cancel(first)  # its status now comes after the present one
+    lost = Problem.of("worker_lost", 500, detail="The worker is gone.")
+    jobs.records.update(
+        sent["running"],
+        lambda held: lifecycle.requeue(
+            held, attempt_id=held.attempt_id, fresh="0" * 20, problem=lost, now=NOW, max_attempts=None, retention=0
+        ),
+    )  # its status comes before the present one
+    assert sorted([first, *(each["record"]["job"]["id"] for each in listed)]) == sorted(sent.values())
 
 
 def test_an_interrupted_first_backup_is_continued(

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pliant.schemas.job import Interpretation, Problem, Status
@@ -16,6 +17,7 @@ from pliant.schemas.options import Options
 from pliant.worker.errors import StoreUnavailable, UnknownJob
 from pliant.worker.execution.workdir import clean_up, last_words, working_directory
 from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
 from pliant.worker.maintenance.fsck import findings
 from pliant.worker.maintenance.reconciler import Reconciler, Stillness
@@ -106,6 +108,34 @@ def test_only_expired_jobs_are_removed(world: World, submit: Callable[[World], s
     assert {job.id for job in world.jobs.page().jobs} == {queued, running, late}
     assert world.jobs.get(late).expires_at is not None
     assert all(early not in key for key, _ in world.jobs.blobs.list("jobs/"))
+
+
+def test_a_new_job_under_an_expired_ones_id_is_kept(
+    world: World, submit: Callable[[World], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    id = submit(world)
+    world.jobs.cancel(id)
+    page = type(world.jobs).page
+
+    def replaced(jobs: Jobs, **given: Any) -> Any:
+        """Delete the job and submit another one once the page is read."""
+        found = page(jobs, **given)
+        if jobs.records.get(id).job.created_at == found.jobs[0].created_at:
+            stored = jobs.records.get(id)
+            jobs.delete(id)
+            later = stored.job.model_copy(update={"created_at": world.now, "expires_at": world.now + timedelta(days=9)})
+            jobs.records.create(stored.model_copy(update={"job": later}))
+        return found
+
+    world.now += timedelta(days=1)
+    monkeypatch.setattr(type(world.jobs), "page", replaced)
+    world.reconciler.retention._expire()
+    assert world.jobs.get(id).status is Status.CANCELLED
+    monkeypatch.undo()
+    world.now += timedelta(days=10)
+    world.reconciler.retention._expire()
+    with pytest.raises(UnknownJob):
+        world.jobs.get(id)
 
 
 def test_without_retention_nothing_expires(world: World, submit: Callable[[World], str]) -> None:

@@ -76,6 +76,8 @@ envFrom:
 - {name: tmp, mountPath: /tmp}
 {{- if eq .Values.storage.type "pvc" }}
 - {name: shared, mountPath: /data/shared}
+# Uploads are in PLIANT_DATA/uploads: any API process continues them, and the reconciler removes expired ones.
+- {name: shared, mountPath: /data/uploads, subPath: uploads}
 {{- end }}
 {{- end }}
 
