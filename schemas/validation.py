@@ -18,6 +18,8 @@ def expectation(error: Mapping[str, Any]) -> str:
     """Describe what one of `ValidationError.errors()` expected, such as ``'l1', 'l2' or 'huber'`` or ``greater than 0``."""
     if error["type"] == "missing":
         return "a value"
+    if error["type"] == "json_invalid":
+        return f"JSON ({error['ctx']['error']})"
     if error["type"] in _LENGTHS:
         words, limit, unit = _LENGTHS[error["type"]]
         count = int(error["ctx"][limit])

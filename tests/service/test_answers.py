@@ -149,6 +149,16 @@ def test_allow_names_every_method_of_an_address(http: httpx.Client) -> None:
     assert allowed("POST", "/v1/jobs/abc/artifacts/shapes.npz") == "GET, HEAD"
 
 
+def test_a_body_that_is_not_json_is_described(http: httpx.Client) -> None:
+    job = submit(http)
+    headers = {"Content-Type": "application/json"}
+    answer = http.post(f"/v1/jobs/{job.id}/shares", content=b'{"days":', headers=headers)
+    assert (answer.status_code, answer.json()["expected"]) == (
+        422,
+        "JSON (EOF while parsing a value at line 1 column 8)",
+    )
+
+
 @pytest.mark.parametrize("path", ["/healthz", "/readyz?exclude=workers"])
 def test_health_checks_answer_head(http: httpx.Client, path: str) -> None:
     answer = http.head(path)
