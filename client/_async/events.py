@@ -13,6 +13,9 @@ from pliant.client.events import MEDIA_TYPE, Parser, Position, merged
 from pliant.client.pauses import async_sleep
 from pliant.schemas.job import Job
 
+HEARTBEAT = 15.0
+"""Seconds between two comments of an event stream in which nothing happens."""
+
 
 async def follow(exchange: Exchange, path: str) -> AsyncGenerator[Job, None]:
     """Yield the job each time its record changes; the last one has a final status.
@@ -58,5 +61,7 @@ async def _stream(exchange: Exchange, path: str, seen: Position) -> AsyncGenerat
                         yield job
                     if seen.final:
                         return
+                if exchange.attempts.remaining() < HEARTBEAT:
+                    return  # a read may take as long as was left when the stream was opened
     except httpx.TransportError as lost:
         await exchange.pause_or_raise(call, lost)

@@ -14,6 +14,9 @@ from pliant.client.events import MEDIA_TYPE, Parser, Position, merged
 from pliant.client.pauses import sleep
 from pliant.schemas.job import Job
 
+HEARTBEAT = 15.0
+"""Seconds between two comments of an event stream in which nothing happens."""
+
 
 def follow(exchange: Exchange, path: str) -> Generator[Job, None, None]:
     """Yield the job each time its record changes; the last one has a final status.
@@ -59,5 +62,7 @@ def _stream(exchange: Exchange, path: str, seen: Position) -> Generator[Job, Non
                         yield job
                     if seen.final:
                         return
+                if exchange.attempts.remaining() < HEARTBEAT:
+                    return  # a read may take as long as was left when the stream was opened
     except httpx.TransportError as lost:
         exchange.pause_or_raise(call, lost)

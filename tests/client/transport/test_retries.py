@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import httpx
 import numpy as np
@@ -281,6 +281,34 @@ def test_a_retried_job_is_one_job_for_one_key(clock: Clock) -> None:
         job = queued(client)
         job.cancel()
         assert job.retry(idempotency_key="again").id == client.retry(job.id, idempotency_key="again").id != job.id
+
+
+def test_an_event_stream_ends_with_the_timeout_between_two_heartbeats(clock: Clock) -> None:
+    class Heartbeats(httpx.SyncByteStream):
+        """A comment every 15 s, if the client reads that long."""
+
+        def __init__(self, request: httpx.Request) -> None:
+            self.request, self.longest = request, request.extensions["timeout"]["read"]
+
+        def __iter__(self) -> Iterator[bytes]:
+            while True:
+                clock.now += min(15.0, self.longest)
+                if self.longest < 15:
+                    raise httpx.ReadTimeout("timed out", request=self.request)
+                yield b": \n\n"
+
+    class Quiet(InMemoryService):
+        def handle_request(self, request: httpx.Request) -> httpx.Response:
+            if request.url.path.endswith("/events"):
+                return httpx.Response(200, headers={"content-type": "text/event-stream"}, stream=Heartbeats(request))
+            return super().handle_request(request)
+
+    with client_of(Quiet(steps=math.inf), clock) as client:
+        job = queued(client)
+        begun = clock.now
+        with pytest.raises(WaitTimeout):
+            job.wait(timeout=31, on_progress=lambda _: None)
+        assert clock.now - begun == pytest.approx(31, abs=0.6)
 
 
 def test_a_service_that_grants_no_wait_is_polled(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
