@@ -79,7 +79,7 @@ def _found(record: type[Any]) -> BaseModel:
         model_config = SettingsConfigDict(
             env_prefix=PREFIX,
             env_ignore_empty=True,
-            env_file=".env",
+            env_file=_dotenv(),
             env_file_encoding="utf-8",
             enable_decoding=False,
             extra="ignore",
@@ -98,6 +98,11 @@ def _found(record: type[Any]) -> BaseModel:
         first = error.errors()[0]
         name = str(first["loc"][0])
         raise InvalidSetting(variable_of(name), expected=expected_of(known[name]), got=repr(first["input"])) from None
+
+
+def _dotenv() -> str | None:
+    """Return `.env`; None in a directory that this user may not enter, such as the home of whoever calls `sudo -u`."""
+    return ".env" if os.access(".", os.X_OK) else None
 
 
 def _secrets() -> str | None:

@@ -88,6 +88,17 @@ def test_environment_overrides_env_file_which_overrides_secret_files(
     assert ServiceSettings.from_environment().port == 7000
 
 
+def test_a_directory_that_may_not_be_entered_has_no_env_file(
+    set_variables: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`sudo -u pliant` in a private home: there, even looking for a file is an error."""
+    (tmp_path / ".env").write_text("PLIANT_WORKERS=7\n")
+    set_variables()
+    assert Settings.from_environment().workers == 7
+    monkeypatch.setattr(os, "access", lambda path, mode: not (path == "." and mode == os.X_OK))
+    assert Settings.from_environment().workers == Settings().workers
+
+
 def test_a_missing_secrets_folder_is_an_error(set_variables: Callable[..., None], tmp_path: Path) -> None:
     set_variables(SECRETS_DIR=str(tmp_path / "none"))
     with pytest.raises(InvalidSetting, match="PLIANT_SECRETS_DIR: expected a folder"):
