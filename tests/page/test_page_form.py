@@ -12,7 +12,7 @@ from pathlib import Path
 import httpx
 import pytest
 from browsing import why_not
-from paging import TRACKS, choose
+from paging import TRACKS, choose, drop
 from playwright.sync_api import Page, expect
 
 pytestmark = [
@@ -173,6 +173,7 @@ def test_a_finished_job_can_be_exported_shared_and_rerun(page: Page, url: str, f
     of_the_link = page.get_by_role("listitem").filter(has_text=f"Link {newest},")
     of_the_link.get_by_role("button", name="Revoke").click()
     expect(of_the_link).to_have_count(0)
+    expect(page.get_by_role("button", name="Create a link")).to_be_focused()
     guest.reload()
     expect(guest.get_by_role("heading", name="This result is no longer available")).to_be_visible()
     expect(guest.get_by_text("This share link is not valid: it was revoked")).to_be_visible()
@@ -212,3 +213,44 @@ def test_invalid_options_and_missing_jobs_show_their_errors(page: Page, url: str
     expect(page.get_by_role("alert")).to_contain_text("There is no job '0123456789abcdef'.")
     expect(page.get_by_text("Use from code")).to_be_hidden()
     assert axe_findings(page) == []
+
+
+def test_files_given_after_run_again_replace_its_inputs_and_its_name(
+    page: Page, url: str, finished: str, small: dict[str, bytes]
+) -> None:
+    page.goto(f"{url}/#job={finished}")
+    name, reused = page.get_by_label("Name (optional)"), page.get_by_text("This job reuses the inputs of")
+    page.get_by_role("button", name="Run again with other options").click()
+    lens = page.locator(".option").filter(has=page.get_by_label("Camera model"))
+    expect(lens.locator(".hint")).to_have_text("No scales.")
+    page.locator("summary", has_text="Lens").click()
+    page.get_by_label("Camera model").select_option(label="automatic")
+    expect(name).to_have_value("a finished face")
+    page.get_by_role("button", name="Use other files").click()
+    expect(page.get_by_label("Film", exact=True)).to_be_focused()
+    expect(name).to_have_value("")
+
+    page.get_by_role("button", name="Run again with other options").click()
+    drop(page, {"other.npz": small[TRACKS]})
+    expect(page.locator("[data-part=tracks]")).to_contain_text("other.npz")
+    expect(page.locator("[data-part=tracks]")).to_be_visible()
+    expect(reused).to_be_hidden()
+    expect(name).to_have_value("other")
+    page.get_by_role("button", name="Remove tracks").click()
+    page.get_by_role("button", name="breathing sphere").click()
+    expect(name).to_have_value("breathing sphere")
+    page.get_by_label("Camera model").select_option(label="automatic")
+    drop(page, {"mine.npz": small[TRACKS]})
+    expect(name).to_have_value("mine")
+
+
+@pytest.mark.usefixtures("front")
+def test_an_invalid_number_in_a_closed_group_is_shown(page: Page) -> None:
+    heading, rate = page.get_by_text("Files to write", exact=True), page.get_by_label("Frame rate")
+    heading.click()
+    rate.fill("-5")
+    heading.click()
+    expect(rate).to_be_hidden()
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(rate).to_be_visible()
+    expect(rate).to_be_focused()

@@ -110,6 +110,22 @@ def test_dropped_files_are_assigned_to_their_parts(page: Page, url: str, small: 
     assert len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"]) == jobs
 
 
+def test_a_dropped_folder_is_left_out_and_the_files_beside_it_are_taken(
+    page: Page, small: dict[str, bytes], tmp_path: Path
+) -> None:
+    folder, tracks = tmp_path / "shots", tmp_path / TRACKS
+    folder.mkdir()
+    tracks.write_bytes(small[TRACKS])
+    page.locator("[data-part=film]").wait_for()
+    session = page.context.new_cdp_session(page)
+    data = {"items": [], "files": [str(folder), str(tracks)], "dragOperationsMask": 1}
+    for kind in ("dragEnter", "dragOver", "drop"):
+        session.send("Input.dispatchDragEvent", {"type": kind, "x": 200, "y": 300, "data": data})
+    session.detach()
+    expect(page.get_by_text("Left out: shots. A folder cannot be read: zip its pictures first.")).to_be_visible()
+    expect(page.locator("[data-part=tracks]")).to_contain_text("tracks 10 × 300 × 2 float64")
+
+
 def test_an_interpretation_can_be_chosen_before_submitting(page: Page, url: str) -> None:
     jobs = len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"])
     choose(page, {TRACKS: packed(W=np.random.default_rng(0).normal(size=(40, 50)))})

@@ -140,6 +140,7 @@ def test_a_point_is_chosen_by_click_by_key_and_by_number(viewer: Page, url: str,
     until(lambda: "In this frame" in facts(viewer))
     clicked = number.input_value()
     viewer.get_by_role("button", name="Clear").click()
+    expect(number).to_be_focused()
     canvas(viewer).press("Enter")
     expect(number).to_have_value(clicked)
     raw = httpx.get(f"{url}/v1/jobs/{jobs[0]}/artifacts/shapes.npz").content
@@ -174,6 +175,10 @@ def test_the_timeline_responds_to_keys_and_describes_each_frame(viewer: Page) ->
     assert len(texts) == 4
     found = r"frame \d+ of 10, expected error [\d.]+\u00a0% of the size, [\d.]+\u00a0% of the points hidden"
     assert all(re.fullmatch(found, str(text)) for text in texts)
+    values = viewer.locator(".probe dl")
+    for action, announced in (("Play", "off"), ("Pause", "polite")):
+        viewer.get_by_role("button", name=action).click()
+        expect(values).to_have_attribute("aria-live", announced)
     chart = viewer.locator(".frames-chart svg").bounding_box()
     assert chart is not None
     viewer.mouse.click(chart["x"] + chart["width"] / 3, chart["y"] + 10)

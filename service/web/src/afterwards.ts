@@ -129,7 +129,10 @@ function sharing(job: Job): HTMLElement {
       ...shares.map((share) => {
         const until = new Date(share.expires_at).toLocaleString();
         const revoke = button("Revoke", () => {
-          revokeShare(job.id, share.id).then(list, (error: unknown) => trouble(made, error));
+          revokeShare(job.id, share.id)
+            .then(list)
+            .then(() => create.focus())
+            .catch((error: unknown) => trouble(made, error));
         });
         return h("li", {}, h("span", {}, `Link ${share.id}, valid until ${until}`), revoke);
       }),

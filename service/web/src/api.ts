@@ -62,6 +62,30 @@ function unreachable(): Refusal {
   });
 }
 
+/** Wait for the network; every failure but an abort means that the service does not answer. */
+export async function reached<T>(waiting: Promise<T>): Promise<T> {
+  try {
+    return await waiting;
+  } catch (error) {
+    throw isAbort(error) ? error : unreachable();
+  }
+}
+
+/** Return true for the error of a request that this page stopped. */
+export function isAbort(error: unknown): boolean {
+  return error instanceof DOMException && error.name === "AbortError";
+}
+
+/** Parse the body of a successful answer; a proxy's page or a body that was cut off may be followed by a better one. */
+function parsed<T>(status: number, text: string): T {
+  try {
+    return JSON.parse(text) as T;
+  } catch {
+    const detail = "The service's answer cannot be read: something between it and this page has changed it. Check the address and the proxy.";
+    throw new Refusal({ title: "Unreadable answer", status, detail, code: "unknown", retryable: true });
+  }
+}
+
 /** Parse problem+json, or describe a response in another format as a problem. */
 function problemOf(status: number, text: string): Problem {
   try {
@@ -77,23 +101,20 @@ function problemOf(status: number, text: string): Problem {
     status,
     detail: `The service answered with status ${status} and no explanation. See its log for details.`,
     code: "unknown",
+    // A proxy answers so while the service restarts or is busy.
+    retryable: status >= 500 || status === 408 || status === 429,
   };
 }
 
 export async function call(path: string, init: RequestInit = {}): Promise<Response> {
-  let answer: Response;
-  try {
-    answer = await fetch(path, { ...init, headers: { ...headers(), ...(init.headers as Record<string, string>) } });
-  } catch (error) {
-    if (error instanceof DOMException && error.name === "AbortError") throw error;
-    throw unreachable();
-  }
-  if (!answer.ok) throw new Refusal(problemOf(answer.status, await answer.text()));
+  const answer = await reached(fetch(path, { ...init, headers: { ...headers(), ...(init.headers as Record<string, string>) } }));
+  if (!answer.ok) throw new Refusal(problemOf(answer.status, await reached(answer.text())));
   return answer;
 }
 
 async function json<T>(path: string, init?: RequestInit): Promise<T> {
-  return (await (await call(path, init)).json()) as T;
+  const answer = await call(path, init);
+  return parsed<T>(answer.status, await reached(answer.text()));
 }
 
 const at = (id: string): string => `v1/jobs/${encodeURIComponent(id)}`;
@@ -148,7 +169,7 @@ export const listExamples = (): Promise<{ examples: Example[] }> => json("v1/exa
 
 export async function exampleFile(name: string, file: string): Promise<File> {
   const answer = await call(`v1/examples/${encodeURIComponent(name)}/${encodeURIComponent(file)}`);
-  return new File([await answer.blob()], file);
+  return new File([await reached(answer.blob())], file);
 }
 
 /** A new idempotency key, by which the service recognises a repeated submission. */
@@ -157,9 +178,9 @@ export function newKey(): string {
 }
 
 /** Submit a new job. Uses XMLHttpRequest, because fetch does not report upload progress. */
-export function submit(form: FormData, key: string, onSent: (fraction: number) => void, signal: AbortSignal): Promise<Job> {
-  return new Promise((resolve, reject) => {
-    const request = new XMLHttpRequest();
+export async function submit(form: FormData, key: string, onSent: (fraction: number) => void, signal: AbortSignal): Promise<Job> {
+  const request = new XMLHttpRequest();
+  await new Promise<void>((resolve, reject) => {
     request.open("POST", "v1/jobs");
     for (const [name, value] of Object.entries(headers())) request.setRequestHeader(name, value);
     request.setRequestHeader("Accept", "application/json");
@@ -167,13 +188,12 @@ export function submit(form: FormData, key: string, onSent: (fraction: number) =
     request.upload.onprogress = (event) => {
       if (event.lengthComputable) onSent(event.loaded / event.total);
     };
-    request.onload = () => {
-      if (request.status >= 200 && request.status < 300) resolve(JSON.parse(request.responseText) as Job);
-      else reject(new Refusal(problemOf(request.status, request.responseText)));
-    };
+    request.onload = () => resolve();
     request.onerror = () => reject(unreachable());
     request.onabort = () => reject(new DOMException("The upload was stopped.", "AbortError"));
     signal.addEventListener("abort", () => request.abort());
     request.send(form);
   });
+  if (request.status < 200 || request.status >= 300) throw new Refusal(problemOf(request.status, request.responseText));
+  return parsed<Job>(request.status, request.responseText);
 }

@@ -20,7 +20,9 @@ export function canRecord(): boolean {
 
 export class CameraDialog {
   private readonly video = h("video", { playsinline: true, "aria-label": "Camera preview" });
-  private readonly words = h("p", { role: "status" });
+  private readonly words = h("span", { role: "status" });
+  /** Outside the status, which would be announced every second. */
+  private readonly left = h("span", {});
   private readonly start = button("Record", () => this.record(), { class: "primary", disabled: true });
   private readonly stop = button("Stop", () => this.recorder?.stop(), { class: "primary", hidden: true, disabled: true });
   private readonly dialog: HTMLDialogElement;
@@ -39,7 +41,7 @@ export class CameraDialog {
       h("h2", { id }, "Record a film"),
       h("p", { class: "hint" }, "Keep the object large, sharp and well lit, and turn it slowly by 30° or more. The film stays in this browser until you press Reconstruct."),
       this.video,
-      this.words,
+      h("p", {}, this.words, this.left),
       h("div", { class: "row" }, this.start, this.stop, button("Cancel", () => this.dialog.close(), { class: "quiet" })),
     );
     this.dialog.addEventListener("close", () => this.close());
@@ -80,6 +82,7 @@ export class CameraDialog {
     });
     recorder.addEventListener("stop", () => {
       if (this.closed) return;
+      say(this.left, "");
       if (parts.length === 0) return say(this.words, "The camera delivered no picture. Cancel, check the camera and record again.");
       this.dialog.close();
       this.onFilm(new File(parts, name, { type: type.split(";")[0] as string }));
@@ -92,7 +95,8 @@ export class CameraDialog {
   }
 
   private count(left: number): void {
-    say(this.words, `Recording, ${left} s left.`);
+    say(this.words, "Recording");
+    say(this.left, `, ${left} s left.`);
     if (left === 0) return this.recorder?.stop();
     this.timer = setTimeout(() => this.count(left - 1), 1000);
   }

@@ -1,6 +1,6 @@
 // The form for a new job: files, their interpretation, options, and errors.
 
-import { type Example, Refusal, exampleFile, getOptions, listExamples, newKey, submit } from "./api";
+import { type Example, Refusal, exampleFile, getOptions, isAbort, listExamples, newKey, submit } from "./api";
 import { button, h } from "./dom";
 import { OptionsForm, drawn, nameOf } from "./options";
 import { refusalBox } from "./refusal";
@@ -13,7 +13,10 @@ import { percent, title } from "./words";
 export class Compose {
   readonly element: HTMLDetailsElement;
   private readonly options = new OptionsForm();
-  private readonly slots = new Slots(() => this.changed());
+  private readonly slots = new Slots(() => {
+    if (this.kept) this.keep(null); // files given after all
+    this.changed();
+  });
   private readonly inspection = new Inspection(
     () => this.form(),
     (refusal) => (refusal ? this.refuse(refusal, () => undefined) : this.clear()),
@@ -33,6 +36,8 @@ export class Compose {
   private readonly keeping = h("div", { class: "keeping", hidden: true });
   /** The automatically filled-in name; a name typed by the user is not overwritten. */
   private filledIn = "";
+  /** The file or job that the filled-in name is of. */
+  private named: File | Job | null = null;
 
   constructor(private readonly onJob: (job: Job) => void) {
     const form = h(
@@ -48,6 +53,12 @@ export class Compose {
     );
     const summary = h("summary", {}, h("h2", { id: "compose-title" }, "New reconstruction"));
     form.addEventListener("change", () => (this.key = null));
+    // The browser shows what is wrong with a field only if the field is visible. This event does not bubble.
+    const unfold = (event: Event): void => {
+      const fold = (event.target as HTMLElement).closest("details");
+      if (fold) fold.open = true;
+    };
+    form.addEventListener("invalid", unfold, true);
     this.options.element.addEventListener("change", () => this.changed());
     this.element = h("details", { class: "card", open: true }, summary, form);
     document.addEventListener("drop", () => (this.element.open = true));
@@ -56,10 +67,18 @@ export class Compose {
   /** The files, or the options for reading them, have changed. */
   private changed(): void {
     this.key = null;
-    const stem = this.slots.main?.name.replace(/\.[^.]*$/, "").slice(0, 200) ?? "";
-    if (this.label.value === this.filledIn) this.label.value = this.filledIn = stem;
+    const { main } = this.slots;
+    if (!this.kept && main !== this.named) {
+      this.named = main;
+      const stem = main?.name.replace(/\.[^.]*$/, "").slice(0, 200) ?? "";
+      if (this.label.value === this.filledIn) this.label.value = this.filledIn = stem;
+    }
     this.offerExamples();
     if (!this.sending) this.inspection.changed();
+  }
+
+  focus(): void {
+    this.element.querySelector("summary")?.focus();
   }
 
   /** Offer examples until files are chosen; the interpretation of the files then takes their place. */
@@ -95,6 +114,7 @@ export class Compose {
   again(job: Job): void {
     this.keep(job);
     this.options.fill(job.options);
+    this.named = job;
     this.label.value = this.filledIn = job.name;
     this.element.open = true;
     this.element.scrollIntoView({ block: "start" });
@@ -111,9 +131,15 @@ export class Compose {
     this.offerExamples();
     if (job === null) this.keeping.replaceChildren();
     else {
-      const other = button("Use other files", () => this.keep(null), { class: "link" });
+      const other = button("Use other files", () => this.useFiles(), { class: "link" });
       this.keeping.replaceChildren(h("p", {}, `This job reuses the inputs of “${title(job)}”. Change the options below. `, other));
     }
+  }
+
+  private useFiles(): void {
+    this.keep(null);
+    this.changed();
+    this.slots.focus(this.slots.hasFilms ? "film" : "tracks");
   }
 
   /** Remove all error messages. */
@@ -144,10 +170,10 @@ export class Compose {
       const files = await Promise.all(
         known.map(async ({ part, file }): Promise<[Part, File]> => [part as Part, await exampleFile(example.name, file)]),
       );
-      this.label.value = example.title;
       this.answer.replaceChildren();
       await this.slots.fill(files);
       if (example.region_polygon) await this.slots.outline(example.region_polygon);
+      this.label.value = this.filledIn = example.title;
       this.send.focus();
     } catch (error) {
       this.refuse(error);
@@ -173,7 +199,9 @@ export class Compose {
     const meter = h("progress", { max: 1, value: 0, "aria-label": "Upload" });
     const words = h("span", { class: "muted" }, "Sending…");
     this.answer.replaceChildren(h("p", { class: "sending" }, meter, words));
+    let sent = false;
     const onSent = (fraction: number): void => {
+      sent = fraction >= 1;
       meter.value = fraction;
       words.textContent = fraction < 1 ? `Sending, ${percent(fraction)}` : "Sent; the service is reading the files…";
     };
@@ -186,8 +214,12 @@ export class Compose {
       else remember(job.id, files);
       this.onJob(job);
     } catch (error) {
-      if (!(error instanceof Refusal && error.problem.status === 0)) this.key = null;
-      this.refuse(error);
+      const unknown = isAbort(error) ? sent : error instanceof Refusal && error.problem.retryable;
+      if (!unknown) this.key = null;
+      if (isAbort(error)) {
+        const words = sent ? "The service already has the files; the job may appear in the list." : "Nothing was submitted.";
+        this.answer.replaceChildren(h("p", { class: "muted" }, `Stopped. ${words}`));
+      } else this.refuse(error);
     } finally {
       this.sending = null;
       this.busy(false);
@@ -221,9 +253,7 @@ export class Compose {
 
   /** Show an error; `again` is called when the user has chosen one of several interpretations. */
   private refuse(error: unknown, again = (): void => this.send.form?.requestSubmit()): void {
-    if (error instanceof DOMException && error.name === "AbortError") {
-      this.answer.replaceChildren(h("p", { class: "muted" }, "Stopped. Nothing was submitted."));
-    } else if (error instanceof Refusal) {
+    if (error instanceof Refusal) {
       const choose = (choice: Record<string, unknown>): void => {
         for (const [name, value] of Object.entries(choice)) this.options.set(name, value);
         again();

@@ -11,6 +11,7 @@ import { Figures } from "./figures";
 import { LiveTracks } from "./live";
 import { newer, progressed } from "./news";
 import { Files, Metrics, Sheet, Warnings, saveLink } from "./results";
+import { rememberSame } from "./sent";
 import { Snippets } from "./snippets";
 import { Tab } from "./tab";
 import { type Job, type Progress, isFinal } from "./types";
@@ -18,7 +19,7 @@ import { Understood } from "./understood";
 import { VerdictBox } from "./verdict";
 import type { Other } from "./viewer/companion";
 import type { Sources } from "./viewer/viewer";
-import { STATUS_WORDS, ago, bytes, percent, standing, title } from "./words";
+import { STATUS_WORDS, ago, bytes, percent, state, timeLeft, title } from "./words";
 
 export interface DetailEvents {
   onJob: (job: Job) => void;
@@ -38,7 +39,10 @@ export class Detail {
   private readonly actions = h("div", { class: "row actions" });
   private readonly verdict = new VerdictBox();
   private readonly figures = new Figures();
-  private readonly standing = h("p", { class: "standing", role: "status" });
+  private readonly state = h("span", { role: "status" });
+  /** Outside the status, which would be announced every second. */
+  private readonly left = h("span", {});
+  private readonly standing = h("p", { class: "standing" }, this.state, this.left);
   private readonly meter = h("progress", { max: 1, value: 0, "aria-label": "Progress of this job" });
   private readonly share = h("span", { class: "muted" });
   private readonly trouble = h("div", { class: "trouble" });
@@ -112,10 +116,15 @@ export class Detail {
       onTrouble: (refusal: Refusal | null) => {
         this.element.classList.toggle("unknown", refusal !== null && this.job === null);
         if (refusal && this.job === null) say(this.heading, refusal.problem.status === 404 ? "This job does not exist" : "This job cannot be shown");
-        this.trouble.replaceChildren(...(refusal ? [refusalBox(refusal.problem)] : []));
+        this.tell(refusal);
       },
     };
     await follow(this.id, follower, this.leaving.signal);
+  }
+
+  /** Show an error above the result, once; null removes it. */
+  private tell(refusal: Refusal | null): void {
+    fill(this.trouble, refusal ? JSON.stringify(refusal.problem) : "", () => (refusal ? [refusalBox(refusal.problem)] : []));
   }
 
   /** An event stream starts with past events: they complete the curves, but must not reset the progress. */
@@ -156,12 +165,14 @@ export class Detail {
       this.finished = true;
       void this.showResult(job);
     }
-    if (!isFinal(job.status)) this.finished = false;
   }
 
   /** Show what changes with time: the progress with the current remaining time. */
   private showProgress(job: Job): void {
-    say(this.standing, job.status === "failed" ? "" : standing(job));
+    const words = job.status === "failed" ? "" : state(job);
+    this.standing.hidden = words === "";
+    say(this.state, words);
+    say(this.left, timeLeft(job));
     this.figures.show(job);
   }
 
@@ -204,27 +215,23 @@ export class Detail {
         .catch((error: unknown) => {
           made.disabled = false;
           if (!(error instanceof Refusal)) throw error;
-          this.trouble.replaceChildren(refusalBox(error.problem));
+          this.tell(error);
         });
     }, { class: label === "Delete" ? "quiet" : null });
     return made;
   }
 
   private acted(label: string, job: Job | undefined): void {
-    this.trouble.replaceChildren();
-    if (label === "Delete") {
-      this.events.onDeleted(this.id);
-      return;
-    }
-    if (!job) return;
+    if (label === "Delete") this.events.onDeleted(this.id);
+    if (job && job.id !== this.id) rememberSame(job.id, this.id);
+    if (!job || this.leaving.signal.aborted) return;
+    this.tell(null);
     if (job.id !== this.id) {
       location.hash = `job=${encodeURIComponent(job.id)}`;
       return;
     }
-    const wasFinal = this.job !== null && isFinal(this.job.status);
     this.show(job);
     this.heading.focus({ preventScroll: true });
-    if (wasFinal) void this.follow(); // the old loop ended with the old attempt
   }
 
   private async showResult(job: Job): Promise<void> {

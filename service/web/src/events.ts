@@ -2,7 +2,7 @@
 //
 // The stream is read with fetch, not EventSource, because EventSource cannot send a bearer token.
 
-import { Refusal, call, getJob } from "./api";
+import { Refusal, call, getJob, isAbort } from "./api";
 import { type Job, type Progress, isFinal } from "./types";
 
 export interface Follower {
@@ -66,12 +66,12 @@ export async function follow(id: string, follower: Follower, signal: AbortSignal
         pause = 500;
       }
     } catch (error) {
-      if (signal.aborted || (error instanceof DOMException && error.name === "AbortError")) return;
+      if (signal.aborted || isAbort(error)) return;
       if (!(error instanceof Refusal)) throw error;
       if (error.problem.code === "no_events") streams = false;
       else {
         follower.onTrouble(error);
-        if (error.problem.status !== 0 && !error.problem.retryable) return;
+        if (!error.problem.retryable) return;
         pause = Math.min(pause * 1.5, 5000);
       }
     }
@@ -106,8 +106,8 @@ async function listen(
       else if (typeof told.stage === "string") follower.onProgress(told as Progress);
     }
   } catch (error) {
-    // After an interrupted stream, the loop fetches the record and reports an error only if that fails too.
-    if (error instanceof DOMException || error instanceof SyntaxError) throw error;
+    // After an interrupted or unreadable stream, the loop fetches the record and reports an error only if that fails too.
+    if (error instanceof DOMException) throw error;
   }
   return last;
 }

@@ -1,6 +1,6 @@
 // Film files: recognising them, and decoding the first frame in the browser.
 
-import { type Entry, type Member, listing, unpacked } from "./peek";
+import { type Entry, type Member, listing, unpacked, unreadable } from "./peek";
 import type { Inspection } from "./types";
 
 const FILMS = /\.(mp4|m4v|mov|webm|mkv|avi|gif|3gp)$/i;
@@ -28,11 +28,6 @@ export function looksLikeTracks(file: File, entries: Entry[]): boolean {
 /** Return true for the name of a picture, which may be a mask. */
 export function looksLikePicture(file: File): boolean {
   return PICTURES.some(([pattern]) => pattern.test(file.name));
-}
-
-/** Return true for errors of a file that is truncated or not in the format of its name: the service will report them. */
-export function unreadable(error: unknown): boolean {
-  return error instanceof DOMException || error instanceof RangeError || error instanceof TypeError;
 }
 
 /** Return the first frame at the film's resolution, or null if this browser cannot decode it. */

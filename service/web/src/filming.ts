@@ -27,7 +27,7 @@ export class Filming {
   private readonly words = h("p", { class: "hint", role: "status" });
   private readonly draw = button("Draw a region", () => this.edit());
   private readonly masks = h("input", { type: "file", accept: "image/png,image/jpeg,image/webp,image/bmp", hidden: true, "aria-label": "Mask picture" });
-  private readonly clear = button("Remove the region", () => this.choose(null), { class: "quiet" });
+  private readonly clear = button("Remove the region", () => this.remove(), { class: "quiet" });
   readonly element = h(
     "div",
     { class: "filming", hidden: true },
@@ -138,6 +138,11 @@ export class Filming {
     const given = { region: drawn?.region ?? null, frame: drawn?.frame ?? 0, picture: drawn?.picture ?? picture };
     const frames = this.undecoded ? Promise.resolve(null) : openFrames(film, this.frames);
     new RegionDialog(given, frames, (done) => this.choose({ ...done, picture: done.picture === this.picture ? null : done.picture })).open();
+  }
+
+  private remove(): void {
+    this.choose(null);
+    this.draw.focus(); // the button, which had the focus, is hidden
   }
 
   private choose(drawn: Drawn | null): void {

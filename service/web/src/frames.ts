@@ -1,6 +1,7 @@
 // The frames of a film by their numbers, as far as this browser can decode them and tell which is which.
 
-import { pictureAt, pictures, unreadable } from "./film";
+import { pictureAt, pictures } from "./film";
+import { unreadable } from "./peek";
 
 /** Frames numbered as the service counts them: in the complete film, from 0. */
 export interface Frames {

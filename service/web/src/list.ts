@@ -1,9 +1,10 @@
 // The list of jobs, newest first.
 
-import { type Refusal, listJobs } from "./api";
+import { listJobs } from "./api";
 import { button, fill, h, say } from "./dom";
 import { follow } from "./events";
 import { newer, progressed } from "./news";
+import { explained } from "./refusal";
 import { type Job, type Progress, isFinal } from "./types";
 import { badge, headline, verdictOf } from "./verdict";
 import { STATUS_WORDS, ago, count, percent, title } from "./words";
@@ -24,11 +25,13 @@ export class JobList {
   readonly element: HTMLDetailsElement;
   private readonly items = h("ol", { class: "jobs" });
   private readonly empty = h("p", { class: "muted" }, "No jobs yet.");
-  private readonly older = button("Older jobs", () => void this.more(), { class: "link", hidden: true });
+  private readonly older = button("Older jobs", () => void explained(this.older, () => this.more()), { class: "link", hidden: true });
   private readonly rows = new Map<string, Row>();
   private readonly followed = new Map<string, AbortController>();
   private jobs: Job[] = [];
   private next: string | null = null;
+  /** Whether older pages are shown, after which `next` follows. */
+  private paged = false;
   private selected: string | null = null;
   /** The selected job that the list was last scrolled to. */
   private revealed: string | null = null;
@@ -52,7 +55,8 @@ export class JobList {
     const oldest = page.jobs.at(-1)?.created_at;
     // A job missing from the newest page still exists only if it is older than that page; otherwise it was deleted.
     const kept = this.jobs.filter((job) => !fresh.has(job.id) && page.next !== null && oldest !== undefined && job.created_at < oldest);
-    if (kept.length === 0) this.next = page.next;
+    this.paged &&= kept.length > 0;
+    if (!this.paged) this.next = page.next;
     this.listed = true;
     const known = new Map(this.jobs.map((job) => [job.id, job]));
     this.jobs = [...page.jobs.map((job) => newer(known.get(job.id) ?? null, job) ?? (known.get(job.id) as Job)), ...kept];
@@ -62,11 +66,11 @@ export class JobList {
 
   private async more(): Promise<void> {
     if (this.next === null) return;
-    const page = await listJobs(this.next).catch((refusal: Refusal) => refusal);
-    if (page instanceof Error) return;
+    const page = await listJobs(this.next);
     const known = new Set(this.jobs.map((job) => job.id));
     this.jobs.push(...page.jobs.filter((job) => !known.has(job.id)));
     this.next = page.next;
+    this.paged = true;
     this.show();
   }
 
@@ -74,7 +78,7 @@ export class JobList {
   update(job: Job): void {
     const at = this.jobs.findIndex((one) => one.id === job.id);
     if (at >= 0) this.jobs[at] = newer(this.jobs[at] ?? null, job) ?? (this.jobs[at] as Job);
-    else this.jobs.unshift(job);
+    else this.jobs.push(job);
     this.show();
   }
 
@@ -101,7 +105,10 @@ export class JobList {
       },
       onTrouble: () => undefined, // the next refresh of the list reports it at the top of the page
     };
-    void follow(id, follower, leaving.signal);
+    // Following ends early if the service refuses, for example without a token; the next refresh of the list begins it again.
+    void follow(id, follower, leaving.signal).finally(() => {
+      if (this.followed.get(id) === leaving) this.followed.delete(id);
+    });
   }
 
   remove(id: string): void {
@@ -124,6 +131,7 @@ export class JobList {
   }
 
   private show(): void {
+    this.jobs.sort((one, other) => (one.created_at < other.created_at ? 1 : one.created_at > other.created_at ? -1 : 0));
     this.followRunning();
     this.empty.hidden = this.jobs.length > 0;
     this.older.hidden = this.next === null;

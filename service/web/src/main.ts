@@ -4,7 +4,7 @@ import { AGAIN } from "./afterwards";
 import { Refusal, hasToken, setSingle, setToken } from "./api";
 import { Compose } from "./compose";
 import { Detail } from "./detail";
-import { button, h } from "./dom";
+import { button, fill, h } from "./dom";
 import { Hero } from "./hero";
 import { JobList } from "./list";
 import { refusalBox } from "./refusal";
@@ -16,6 +16,9 @@ const trouble = document.getElementById("trouble") as HTMLElement;
 const side = document.getElementById("side") as HTMLElement;
 const main = document.getElementById("main") as HTMLElement;
 const welcome = document.getElementById("welcome") as HTMLElement;
+/** An error that affects the whole page, and the token form, which outlasts other errors: it may be half filled in. */
+const [said, gate] = [h("div", {}), h("div", {})];
+trouble.append(said, gate);
 
 const list = new JobList();
 const compose = new Compose((job: Job) => {
@@ -42,8 +45,9 @@ function show(id: string | null, byPerson: boolean): void {
     onJob: (job) => list.update(job),
     onDeleted: (deleted) => {
       list.remove(deleted);
+      if (detail?.id !== deleted) return; // another job was opened before the answer
       location.hash = "";
-      document.getElementById("compose-title")?.scrollIntoView({ block: "nearest" });
+      compose.focus();
     },
   });
   main.append(detail.element);
@@ -58,25 +62,33 @@ const GATE = "This service needs a token. Paste the token you were given; this p
 
 /** Show an error that affects the whole page at the top, with a token form if a token is missing. */
 function report(error: unknown): void {
-  if (!(error instanceof Refusal)) throw error;
+  if (!(error instanceof Refusal)) return reportError(error); // the page keeps refreshing
   const { problem } = error;
   // The service's message for a missing token is about an HTTP header, which is of no use to a visitor.
   const words = problem.code === "unauthorized" ? { ...problem, detail: GATE } : problem;
-  const parts: Node[] = [refusalBox(words)];
-  if (problem.status === 401) parts.push(tokenForm());
-  if (trouble.childElementCount === 0 || problem.status !== 401) trouble.replaceChildren(...parts);
+  fill(said, JSON.stringify(words), () => [refusalBox(words)]);
+  if (problem.status === 401 && gate.childElementCount === 0) gate.append(tokenForm());
+}
+
+/** Remove the error and the token form: the service has answered, or has a new token to judge. */
+function clear(): void {
+  fill(said, "", () => []);
+  gate.replaceChildren();
 }
 
 function tokenForm(): HTMLElement {
   const input = h("input", { type: "password", id: "token", autocomplete: "off", required: true });
   const form = h("form", { class: "row" }, h("label", { for: "token" }, "Token"), input, h("button", { type: "submit" }, "Use"));
-  if (hasToken()) form.append(button("Forget the rejected token", () => setToken(""), { class: "quiet" }));
-  form.addEventListener("submit", (event) => {
-    event.preventDefault();
-    setToken(input.value.trim());
-    trouble.replaceChildren();
+  const use = (token: string): void => {
+    setToken(token);
+    clear();
     show(named(), false);
     void start();
+  };
+  if (hasToken()) form.append(button("Forget the rejected token", () => use(""), { class: "quiet" }));
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    use(input.value.trim());
   });
   return form;
 }
@@ -101,7 +113,7 @@ async function start(): Promise<void> {
     offer();
     const jobs = await list.refresh();
     for (const job of jobs) if (job.id === detail?.id) detail.learn(job);
-    trouble.replaceChildren();
+    clear();
   } catch (error) {
     report(error);
   }

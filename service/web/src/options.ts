@@ -199,13 +199,13 @@ export class OptionsForm {
   set(name: string, value: unknown): void {
     const field = this.fields.find((one) => one.name === name);
     field?.write(value);
-    field?.fold.dispatchEvent(new Event("change", { bubbles: true }));
+    field?.element.dispatchEvent(new Event("change", { bubbles: true }));
   }
 
   /** Fill the form with the options of a job. */
   fill(options: Options): void {
     for (const field of this.fields) field.write(field.name in options ? options[field.name] : (field.schema.default ?? null));
-    for (const fold of new Set(this.fields.map((field) => field.fold))) fold.dispatchEvent(new Event("change", { bubbles: true }));
+    for (const { element } of this.fields) element.dispatchEvent(new Event("change", { bubbles: true }));
   }
 
   focus(): void {

@@ -10,6 +10,19 @@ const LOCAL = 0x04034b50;
 const CENTRAL = 0x02014b50;
 const END = 0x06054b50;
 
+/** Return true for errors of a file that is truncated or not in the format of its name: the service will report them. */
+export function unreadable(error: unknown): boolean {
+  return error instanceof DOMException || error instanceof RangeError || error instanceof TypeError;
+}
+
+/** Return false for a folder, which is dropped like a file but has no contents to read. */
+export async function isReadable(file: File): Promise<boolean> {
+  return file.slice(0, 1).arrayBuffer().then(
+    () => true,
+    () => false,
+  );
+}
+
 /** Return the arrays of an .npy or .npz file, or an empty list for any other file. Malformed files do not throw. */
 export async function peek(file: File): Promise<Entry[]> {
   try {
@@ -20,8 +33,7 @@ export async function peek(file: File): Promise<Entry[]> {
     }
     if (new DataView(head.buffer).getUint32(0, true) === LOCAL) return await members(file);
   } catch (error) {
-    // The file is truncated or malformed: the service will report the error.
-    if (!(error instanceof RangeError || error instanceof TypeError)) throw error;
+    if (!unreadable(error)) throw error;
   }
   return [];
 }

@@ -1,5 +1,6 @@
 // An error message: a sentence, the expected and the actual value, advice, and links.
 
+import { Refusal } from "./api";
 import { button, h } from "./dom";
 import type { Problem } from "./types";
 
@@ -47,6 +48,17 @@ export function refusalBox(problem: Problem, choose?: ((choice: Record<string, u
     choices.length > 0 && h("div", { class: "row", role: "group", "aria-label": "Possible interpretations" }, ...choices),
     h("p", { class: "row small" }, ...helpLinks(problem), h("span", { class: "code" }, problem.code)),
   );
+}
+
+/** Do what a control asks for; an error is shown after the control until it is used again. */
+export async function explained(control: HTMLElement, action: () => Promise<void>): Promise<void> {
+  if (control.nextElementSibling?.matches(".refusal")) control.nextElementSibling.remove();
+  try {
+    await action();
+  } catch (error) {
+    if (!(error instanceof Refusal)) throw error;
+    control.after(refusalBox(error.problem));
+  }
 }
 
 /** Text between backticks as code. */

@@ -139,7 +139,7 @@ export function saveLink(job: Job, artifact: Artifact, words: string, kind: stri
   link.addEventListener("click", (event) => {
     if (!("Authorization" in headers())) return;
     event.preventDefault(); // a plain link cannot carry the token
-    void saveWithToken(path, artifact.name);
+    void saveWithToken(link, path, artifact.name);
   });
   return link;
 }

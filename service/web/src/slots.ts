@@ -4,7 +4,7 @@ import { CameraDialog, canRecord } from "./camera";
 import { button, h, say, uniqueId } from "./dom";
 import { looksLikeFilm, looksLikePicture, looksLikeTracks, servedFrame } from "./film";
 import { Filming } from "./filming";
-import { type Entry, describe, peek } from "./peek";
+import { type Entry, describe, isReadable, peek } from "./peek";
 import type { Point } from "./region";
 import { type Inspection, type Options, PARTS, type Part } from "./types";
 import { bytes } from "./words";
@@ -119,7 +119,9 @@ export class Slots {
 
   /** Assign dropped files to slots by their names and contents. */
   async take(files: File[]): Promise<void> {
-    const read = await Promise.all(files.map(async (file): Promise<[File, Entry[]]> => [file, await peek(file)]));
+    const readable = await Promise.all(files.map(isReadable));
+    const contents = files.filter((_, index) => readable[index]);
+    const read = await Promise.all(contents.map(async (file): Promise<[File, Entry[]]> => [file, await peek(file)]));
     // The meaning of the other files depends on the film or the tracks.
     const rank = ([file, entries]: [File, Entry[]]): number =>
       looksLikeFilm(file, entries) ? 0 : looksLikeTracks(file, entries) && roleOf(file.name, entries, false) === "tracks" ? 1 : 2;
@@ -131,7 +133,8 @@ export class Slots {
       else await this.show(part, file);
       if (part === "tracks") await this.show("film", null); // the last drop wins
     }
-    if (files.length > 0) await this.settle(leftOut);
+    const folders = files.filter((_, index) => !readable[index]).map(({ name }) => name);
+    if (files.length > 0) await this.settle(leftOut, folders);
   }
 
   /** Return the part that a dropped file belongs to; null if it is of an unknown kind, or does not belong to a film. */
@@ -145,14 +148,16 @@ export class Slots {
   }
 
   /** Report the files that were left out; a picture chosen as a mesh before its film is the film's mask. */
-  private async settle(leftOut: string[] = []): Promise<void> {
+  private async settle(leftOut: string[] = [], folders: string[] = []): Promise<void> {
     const [film, mesh] = [this.file("film"), this.file("mesh")];
     if (film && mesh && looksLikePicture(mesh)) {
       await this.show("mesh", null);
       await this.filming.useMask(mesh);
     }
     const belongs = film ? "Only a mask picture can be added to a film." : "This page does not know files of this kind.";
-    say(this.leftOut, leftOut.length > 0 ? `Left out: ${leftOut.join(", ")}. ${belongs}` : "");
+    const reasons: [string[], string][] = [[leftOut, belongs], [folders, "A folder cannot be read: zip its pictures first."]];
+    const told = reasons.filter(([names]) => names.length > 0).map(([names, why]) => `Left out: ${names.join(", ")}. ${why}`);
+    say(this.leftOut, told.join(" "));
     this.onChange();
   }
 

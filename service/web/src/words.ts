@@ -106,6 +106,18 @@ const STAGES: Record<string, string> = {
 
 /** One line on the state of a job. */
 export function standing(job: Job): string {
+  return `${state(job)}${timeLeft(job)}`;
+}
+
+/** The end of that line: the time that a running job still needs. */
+export function timeLeft({ status, progress }: Job): string {
+  if (status !== "running") return "";
+  const left = progress?.seconds_left ?? null;
+  return left === null ? "." : `; about ${seconds(left)} left.`;
+}
+
+/** The line without its end. */
+export function state(job: Job): string {
   switch (job.status) {
     case "queued":
       if (job.place_in_queue === null) return "Queued; waiting for a worker.";
@@ -114,14 +126,13 @@ export function standing(job: Job): string {
         : `Queued; ${count(job.place_in_queue, "job")} ahead of this one.`;
     case "running": {
       const progress = job.progress;
-      if (progress === null) return "Started.";
+      if (progress === null) return "Started";
       const stage = STAGES[progress.stage] ?? progress.stage;
       const step =
         progress.stage === "reweight" && progress.max_reweightings > 0
           ? `, reweighting ${progress.reweighting}`
           : "";
-      const left = progress.seconds_left === null ? "" : `; about ${seconds(progress.seconds_left)} left`;
-      return `${stage}${step}${left}.`;
+      return `${stage}${step}`;
     }
     case "cancelling":
       return "Stopping at the next iteration.";

@@ -5,12 +5,14 @@ from __future__ import annotations
 import io
 import os
 import shutil
+import time
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
 import numpy as np
 from PIL import Image
-from playwright.sync_api import Browser, Playwright, expect, sync_playwright
+from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
 
 ROOT = Path(__file__).parents[3]
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -60,6 +62,14 @@ class Browsing:
             self._browser.close()
         if self._playwright is not None:
             self._playwright.stop()
+
+
+def heard(page: Page, holds: Callable[[], bool], seconds: float = 30) -> None:
+    """Wait for what a route handler notes: Playwright runs handlers only within its own calls."""
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, "it did not happen in time"
+        page.wait_for_timeout(50)
 
 
 def differing_pixels(one: bytes, other: bytes) -> float:

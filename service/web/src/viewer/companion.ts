@@ -18,8 +18,9 @@ export class Companion {
 
   static async open(other: Other, signal: AbortSignal): Promise<Companion> {
     const preview = await Preview.open(other.preview, signal);
-    if (preview.ready === 0) await new Promise<void>((resolve) => (preview.onFrames = resolve));
-    return new Companion(preview, preview.has("picture") ? await pictureOf(preview, signal) : null);
+    const picture = preview.has("picture") ? await pictureOf(preview, signal) : null;
+    signal.throwIfAborted();
+    return new Companion(preview, picture);
   }
 
   private constructor(

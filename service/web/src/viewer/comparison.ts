@@ -32,8 +32,11 @@ export class Comparison {
 
   private readonly own: HTMLElement;
   private title = "";
+  /** Ends what the last choice asked for. */
+  private asking = new AbortController();
 
   constructor(private readonly parts: Compared) {
+    parts.signal.addEventListener("abort", () => this.asking.abort());
     this.own = h("span", { class: "view-name" }, `${parts.title} (this job)`);
   }
 
@@ -61,7 +64,10 @@ export class Comparison {
   }
 
   private async show(other: Other | null): Promise<void> {
-    const { timeline, panes, signal, paint, repaint, guarded } = this.parts;
+    const { timeline, panes, paint, repaint, guarded } = this.parts;
+    this.asking.abort();
+    this.asking = new AbortController();
+    const { signal } = this.asking;
     await guarded(async () => {
       this.companion?.dispose();
       this.companion = null;
@@ -78,6 +84,7 @@ export class Comparison {
       panes.append(companion.element);
       timeline.compare(companion.preview, other.title);
       const values = await this.difference();
+      signal.throwIfAborted();
       if (values) {
         this.offerDifference(true);
         paint(values);

@@ -3,7 +3,7 @@
 // Positions are int16 on a uniform grid, frame after frame, so the first frame can be drawn while later ones are loading;
 // residuals and ground truth are fetched by byte range when first needed.
 
-import { Refusal, call, headers } from "../api";
+import { Refusal, call, headers, reached } from "../api";
 
 const MAGIC = "PLIANTPV";
 const PREFIX = 16;
@@ -98,6 +98,8 @@ export class Preview {
   ready = 0;
   /** Called when more frames have loaded. */
   onFrames: () => void = () => undefined;
+  /** Settles when all frames have loaded or no more will. */
+  readonly loaded: Promise<void>;
   private readonly fields = new Map<Field, Promise<unknown>>();
 
   private constructor(
@@ -111,8 +113,11 @@ export class Preview {
     private readonly frameTable: Float32Array,
     /** 2 per point: number of frames in which it is visible, and in which it is rejected; empty in files of older services. */
     private readonly pointTable: Uint32Array,
+    signal: AbortSignal,
   ) {
     this.positions = new Int16Array(3 * header.num_points * header.num_frames);
+    this.loaded = this.stream(signal);
+    this.loaded.catch(() => undefined); // `first` and the viewer report it
   }
 
   get frames(): number {
@@ -127,7 +132,7 @@ export class Preview {
     return this.header.sections[field] !== undefined;
   }
 
-  /** Read header, faces and cameras; positions continue to load afterwards. */
+  /** Read header, faces, cameras and the first frame; positions continue to load afterwards. */
   static async open(url: string, signal: AbortSignal): Promise<Preview> {
     const start = await range(url, 0, 4096, signal);
     if (new TextDecoder().decode(start.subarray(0, 8)) !== MAGIC) throw new Error("This is not a preview file.");
@@ -149,8 +154,10 @@ export class Preview {
       new Float32Array(aligned(tables, cameras.offset - faces.offset, cameras.bytes)),
       new Float32Array(aligned(frameTable, 0, frames.bytes)),
       new Uint32Array(aligned(pointTable, 0, points.bytes)),
+      signal,
     );
-    void preview.stream(signal);
+    const first = new Promise<void>((resolve) => (preview.onFrames = resolve));
+    await Promise.race([first, preview.loaded]);
     return preview;
   }
 
@@ -232,7 +239,8 @@ export class Preview {
     const perFrame = 6 * this.points;
     let filled = 0;
     let failures = 0;
-    while (filled < bytes && !signal.aborted) {
+    while (filled < bytes) {
+      const before = filled;
       try {
         const answer = await ask(this.url, offset + filled, bytes - filled, signal);
         const reader = (answer.body as ReadableStream<Uint8Array>).getReader();
@@ -244,17 +252,18 @@ export class Preview {
           skip -= value.length - part.length;
           raw.set(part.subarray(0, bytes - filled), filled);
           filled = Math.min(bytes, filled + part.length);
-          failures = 0;
           if (Math.floor(filled / perFrame) > this.ready) {
             this.ready = Math.floor(filled / perFrame);
             this.onFrames();
           }
         }
         void reader.cancel().catch(() => undefined);
+        if (filled === before) throw new Error("The service sent no more of the mesh.");
+        failures = 0;
       } catch (error) {
-        failures += 1;
-        if (signal.aborted || failures > 5) return;
-        if (error instanceof Refusal && error.problem.status !== 0) return;
+        failures = filled > before ? 1 : failures + 1;
+        if (signal.aborted || failures > 5) throw error;
+        if (error instanceof Refusal && !error.problem.retryable) throw error;
         await new Promise((resolve) => setTimeout(resolve, 1000 * failures));
       }
     }
@@ -278,6 +287,6 @@ function ask(url: string, offset: number, length: number, signal: AbortSignal): 
 
 async function range(url: string, offset: number, length: number, signal: AbortSignal): Promise<Uint8Array> {
   const answer = await ask(url, offset, length, signal);
-  const raw = new Uint8Array(await answer.arrayBuffer());
+  const raw = new Uint8Array(await reached(answer.arrayBuffer()));
   return answer.status === 206 ? raw : raw.subarray(offset, offset + length);
 }

@@ -33,7 +33,11 @@ export class Probe {
       const asked = this.input.valueAsNumber;
       this.choose(Number.isInteger(asked) && asked >= 0 && asked <= last ? asked : null, false);
     });
-    this.clear = button("Clear", () => this.choose(null), { class: "quiet", hidden: true });
+    const clear = (): void => {
+      this.choose(null);
+      this.input.focus(); // the button, which had the focus, is hidden
+    };
+    this.clear = button("Clear", clear, { class: "quiet", hidden: true });
     const hint = h("p", { class: "hint", id: `${id}-hint` }, "or click one in the picture");
     this.input.setAttribute("aria-describedby", hint.id);
     this.element = h("div", { class: "probe" }, h("span", { class: "tool" }, h("label", { for: id }, "Point"), this.input, this.clear, hint), this.list);
@@ -41,6 +45,11 @@ export class Probe {
     this.marker.renderOrder = 2;
     this.marker.visible = false;
     this.marker.geometry.setAttribute("position", new BufferAttribute(new Float32Array(3), 3));
+  }
+
+  /** Keep screen readers from announcing the values of every frame while the shape is played. */
+  hush(playing: boolean): void {
+    this.list.setAttribute("aria-live", playing ? "off" : "polite");
   }
 
   theme(colour: string): void {

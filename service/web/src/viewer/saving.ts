@@ -28,6 +28,8 @@ export interface Saveable {
 export class Saving {
   readonly element: HTMLElement;
   private readonly words = h("p", { class: "hint", role: "status" });
+  /** Outside the status, which would be announced every second. */
+  private readonly left = h("span", { class: "hint", hidden: true });
   private readonly stop = button("Stop recording", () => this.recording?.abort(), { hidden: true });
   private recording: AbortController | null = null;
 
@@ -50,6 +52,7 @@ export class Saving {
         hasPage && button("HTML page", () => void this.page()),
         what.usdz !== undefined && quickLookLink(what.usdz, "View in AR (USDZ)"),
         this.stop,
+        this.left,
       ),
       h("p", { class: "hint", hidden: unsupported === "" }, unsupported),
       this.words,
@@ -67,16 +70,19 @@ export class Saving {
     if (format === null || this.recording) return;
     const recording = (this.recording = new AbortController());
     const end = this.what.begin();
-    this.stop.hidden = false;
+    this.stop.hidden = this.left.hidden = false;
     const seconds = Math.min(LONGEST, kind === "turntable" ? Math.max(TURNTABLE_SECONDS, this.what.seconds) : this.what.seconds);
-    const onShare = (share: number): void => say(this.words, `Recording, ${Math.round(seconds * (1 - share))} s left…`);
+    const onShare = (share: number): void => {
+      say(this.words, "Recording…");
+      say(this.left, `${Math.round(seconds * (1 - share))} s left`);
+    };
     await this.guarded(async () => {
       const draw = (share: number): HTMLCanvasElement[] => this.what.pose(share, kind);
       const made = await record({ seconds, fps: FPS, draw, background: this.what.background(), onShare }, format.type, recording.signal);
       save(made, fileName(this.what.title, `-${kind}${format.end}`));
     });
     this.recording = null;
-    this.stop.hidden = true;
+    this.stop.hidden = this.left.hidden = true;
     if (!this.what.signal.aborted) end();
   }
 

@@ -1,5 +1,6 @@
 // The viewer: the animated result with its controls. This module and three.js are loaded as a separate chunk.
 
+import { isAbort } from "../api";
 import { button, h, say } from "../dom";
 import { Body, seenFromBehind } from "./body";
 import { type Colouring, type Values, colourings, valuesFor } from "./colours";
@@ -49,15 +50,19 @@ export class Viewer {
   private dots: TrackDots | null = null;
   private pane: FilmPane | null = null;
   private following = false;
+  private wired = false;
+  /** What the switches ask for; an array may arrive after its switch was turned again. */
+  private readonly wanted = { tracks: false, truth: false, beside: false, over: false };
   private readonly leaving = new AbortController();
   private readonly view = h("div", { class: "view" });
   private readonly panes = h("div", { class: "panes" });
   private readonly labels = h("div", { class: "view-labels", hidden: true }, h("span", {}, "result"), h("span", {}, "ground truth"));
   private readonly legend = h("div", { class: "legend", hidden: true });
   private readonly play = h("button", { type: "button", class: "play" });
-  private readonly clock = h("output", { class: "clock" });
+  private readonly clock = h("span", { class: "clock" });
   private readonly mirrored = h("p", { class: "hint" }, "Depth is mirrored to match the ground truth; the files are not.");
   private readonly trouble = h("p", { class: "muted", role: "status" });
+  private readonly incomplete = h("p", { class: "muted", role: "status" });
   private readonly themes = matchMedia("(prefers-color-scheme: dark)");
 
   /** Fetch a result and show it inside `holder`. */
@@ -67,7 +72,7 @@ export class Viewer {
       // A result can be viewed without its film.
       sources.film === undefined ? null : FilmFrames.open(sources.film, signal).catch(() => null),
     ]);
-    if (preview.ready === 0) await new Promise<void>((resolve) => (preview.onFrames = resolve));
+    signal.throwIfAborted(); // a viewer that is opened now would never be closed
     return new Viewer(holder, sources, preview, film, signal);
   }
 
@@ -108,6 +113,9 @@ export class Viewer {
     this.stage.onDraw = () => this.place();
     this.stage.onTurn = () => this.follow(false);
     preview.onFrames = () => (preview.ready === preview.frames ? this.stage.refit() : this.stage.redraw());
+    preview.loaded.catch(() => {
+      if (!signal.aborted) say(this.incomplete, `Only ${preview.ready} of ${preview.frames} frames could be loaded. Reload the page to try again.`);
+    });
     this.themes.addEventListener("change", this.repaint);
     signal.addEventListener("abort", () => this.dispose());
     this.repaint();
@@ -148,7 +156,7 @@ export class Viewer {
     const corner = h("div", { class: "corner" }, full, button("Help", () => openHelp(this.holder)));
     const thinned = preview.header.frame_stride > 1 ? `Every ${ordinal(preview.header.frame_stride)} frame is shown; the files contain all frames.` : "";
     const note = h("p", { class: "hint", hidden: !thinned }, thinned);
-    const main = h("div", { class: "stage-main" }, corner, this.panes, this.legend, this.comparison.summary, time, note, this.mirrored, this.trouble);
+    const main = h("div", { class: "stage-main" }, corner, this.panes, this.legend, this.comparison.summary, time, note, this.mirrored, this.incomplete, this.trouble);
     this.holder.replaceChildren(main, this.tools());
   }
 
@@ -236,6 +244,7 @@ export class Viewer {
   private showState(): void {
     this.play.setAttribute("aria-label", this.player.playing ? "Pause" : "Play");
     this.play.dataset["playing"] = String(this.player.playing);
+    this.probe.hush(this.player.playing);
   }
 
   private moved(): void {
@@ -278,20 +287,21 @@ export class Viewer {
   }
 
   private wireframe(on: boolean): void {
-    this.body.wireframe(on);
-    this.truth?.wireframe(on);
-    this.comparison.companion?.wireframe(on);
-    this.stage.redraw();
+    this.wired = on;
+    this.repaint();
   }
 
   private async tracks(on: boolean): Promise<void> {
+    this.wanted.tracks = on;
     await this.guarded(async () => {
       if (!on && this.dots) {
         this.stage.remove(this.dots.group);
         this.dots.dispose();
         this.dots = null;
-      } else if (on && !this.dots) {
-        this.dots = new TrackDots(this.preview, await this.preview.field("residuals", this.leaving.signal));
+      } else if (on) {
+        const residuals = await this.preview.field("residuals", this.leaving.signal);
+        if (!this.wanted.tracks || this.dots) return;
+        this.dots = new TrackDots(this.preview, residuals);
         this.repaint();
         this.stage.add(this.dots.group);
       }
@@ -299,9 +309,12 @@ export class Viewer {
   }
 
   private async withTruth(on: boolean): Promise<void> {
+    this.wanted.truth = on;
     await this.guarded(async () => {
-      if (on && !this.truth) {
-        this.truth = new Body(this.preview, await this.preview.field("truth", this.leaving.signal));
+      const positions = on && !this.truth ? await this.preview.field("truth", this.leaving.signal) : null;
+      if (this.wanted.truth !== on) return;
+      if (positions && !this.truth) {
+        this.truth = new Body(this.preview, positions);
         this.truth.reverse(this.behind !== this.stage.isFlipped);
         this.repaint();
         this.stage.add(this.truth.group, 1);
@@ -314,6 +327,7 @@ export class Viewer {
 
   /** Show the film, or the tracks alone, beside the mesh; beside its film, the mesh is viewed through the same camera. */
   private async beside(on: boolean): Promise<void> {
+    this.wanted.beside = on;
     if (on && this.film && this.pane === null) this.follow(true);
     await this.guarded(async () => {
       if (!on) {
@@ -321,9 +335,12 @@ export class Viewer {
         this.panes.removeAttribute("style");
         this.panes.classList.remove("wide");
         this.pane = null;
+        this.wanted.over = false;
         this.check("over", false);
       } else if (this.pane === null) {
-        this.pane = new FilmPane(this.preview, await this.preview.field("residuals", this.leaving.signal), this.film);
+        const residuals = await this.preview.field("residuals", this.leaving.signal);
+        if (!this.wanted.beside || this.pane) return;
+        this.pane = new FilmPane(this.preview, residuals, this.film);
         this.panes.prepend(h("div", { class: "view film" }, this.pane.canvas));
         this.panes.style.setProperty("--shape", String(this.pane.shape));
         this.panes.classList.toggle("wide", this.pane.shape >= WIDE);
@@ -334,10 +351,11 @@ export class Viewer {
   }
 
   private async meshOver(on: boolean): Promise<void> {
+    this.wanted.over = on;
     if (on) await this.beside(true);
     if (this.pane === null) return;
-    this.pane.showsMesh = on;
-    this.pane.showsTracks = !on;
+    this.pane.showsMesh = this.wanted.over;
+    this.pane.showsTracks = !this.wanted.over;
     this.stage.redraw();
   }
 
@@ -387,8 +405,10 @@ export class Viewer {
   private readonly repaint = (): void => {
     const style = getComputedStyle(this.view);
     const colour = (name: string): string => style.getPropertyValue(name).trim();
-    for (const body of [this.body, this.truth]) body?.theme(colour("--clay"), colour("--wire"));
-    this.comparison.companion?.theme(colour("--clay"), colour("--wire"));
+    for (const shown of [this.body, this.truth, this.comparison.companion]) {
+      shown?.theme(colour("--clay"), colour("--wire"));
+      shown?.wireframe(this.wired);
+    }
     this.dots?.theme(colour("--dots"));
     this.probe.theme(colour("--dots"));
     this.pane?.theme(colour("--dots"), this.film ? "#ffffff" : colour("--wire"));
@@ -401,7 +421,8 @@ export class Viewer {
       await action();
       say(this.trouble, "");
     } catch (error) {
-      if (!this.leaving.signal.aborted) say(this.trouble, error instanceof Error ? error.message : String(error));
+      // What this page has stopped is no longer wanted.
+      if (!isAbort(error)) say(this.trouble, error instanceof Error ? error.message : String(error));
     }
   }
 
