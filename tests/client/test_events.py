@@ -145,7 +145,7 @@ def test_the_timeout_also_ends_a_stream_without_events() -> None:
                 return httpx.Response(200, stream=Heartbeats(), headers={"Content-Type": "text/event-stream"})
             return super().handle_request(request)
 
-    with Client("http://pliant.test", transport=Silent(), retries=QUICK) as client:
+    with Client("http://pliant.test", transport=Silent(steps=math.inf), retries=QUICK) as client:
         job = client.submit(POINTS)
         with pytest.raises(WaitTimeout):
             list(job.events(timeout=0.1))
