@@ -140,9 +140,9 @@ def test_older_jobs_can_be_listed_while_an_old_job_is_shown(page: Page, url: str
 def test_a_refused_download_is_explained_beside_its_link(page: Page, url: str, finished: str) -> None:
     usdz = {"name": "shapes.usdz", "bytes": 1, "sha256": "0", "description": "", "media_type": "model/vnd.usdz+zip"}
     own = record(url, finished)
-    page.route(
-        f"**/v1/jobs/{finished}", lambda route: route.fulfill(json={**own, "artifacts": [*own["artifacts"], usdz]})
-    )
+    own["artifacts"].append(usdz)
+    page.route(f"**/v1/jobs/{finished}", lambda route: route.fulfill(json=own))
+    page.route(LIST, lambda route: route.fulfill(json={"jobs": [own], "next": None}))
     page.goto(url)
     page.evaluate("() => { DOMTokenList.prototype.supports = (word) => word === 'ar'; }")
     page.evaluate("(id) => (location.hash = `job=${id}`)", finished)
@@ -178,6 +178,7 @@ def test_a_repeated_submission_keeps_its_key_until_the_service_has_answered(
     }""")
     page.route("**/v1/jobs", answer)
     choose(page, {TRACKS: small[TRACKS]})
+    expect(page.get_by_role("region", name="How your files are interpreted")).to_contain_text("frames of")
     send = page.get_by_role("button", name="Reconstruct")
     send.click()
     expect(page.get_by_text("Sent; the service is reading the files…")).to_be_visible()

@@ -32,13 +32,18 @@ def release(held: list[Route]) -> None:
             route.continue_()
 
 
+def only(page: Page, job: dict[str, Any]) -> None:
+    """Answer with this record of a job, also in the list, which is the job's only one."""
+    page.route(f"**/v1/jobs/{job['id']}", lambda route: route.fulfill(json=job))
+    page.route(re.compile(r"/v1/jobs\?"), lambda route: route.fulfill(json={"jobs": [job], "next": None}))
+
+
 def test_a_job_left_while_its_film_loads_opens_no_viewer(page: Page, url: str, finished: str) -> None:
     own = record(url, finished)
     film = {**own["artifacts"][0], "name": "film_frames.bin"}
     held: list[Route] = []
-    page.route(
-        f"**/v1/jobs/{finished}", lambda route: route.fulfill(json={**own, "artifacts": [*own["artifacts"], film]})
-    )
+    own["artifacts"].append(film)
+    only(page, own)
     page.route("**/film_frames.bin", lambda route: held.append(route))
     page.goto(f"{url}/#job={finished}")
     heard(page, lambda: held != [])
@@ -128,7 +133,7 @@ def test_the_answer_to_a_deletion_does_not_leave_a_job_opened_since(page: Page, 
 
 def test_a_job_tried_again_is_opened_and_has_the_same_files(page: Page, url: str, finished: str) -> None:
     again = record(url, finished, id=OTHER, status="queued", name="again")
-    page.route(f"**/v1/jobs/{finished}", lambda route: route.fulfill(json=record(url, finished, status="cancelled")))
+    only(page, record(url, finished, status="cancelled"))
     page.route(f"**/v1/jobs/{finished}/retry", lambda route: route.fulfill(status=202, json=again))
     page.route(f"**/v1/jobs/{OTHER}", lambda route: route.fulfill(json=again))
     page.goto(url)
@@ -145,7 +150,7 @@ def test_a_job_tried_again_is_opened_and_has_the_same_files(page: Page, url: str
 def test_a_status_read_aloud_does_not_count_seconds(page: Page, url: str, finished: str) -> None:
     progress = {"stage": "finish", "fraction": 0.5, "updated_at": "2026-05-04T09:30:00Z", "seconds_left": 40.0}
     running = record(url, finished, status="running", artifacts=[], progress=progress)
-    page.route(f"**/v1/jobs/{finished}", lambda route: route.fulfill(json=running))
+    only(page, running)
     page.route(f"**/v1/jobs/{finished}/events", lambda route: route.fulfill(status=404, json={}))
     page.goto(f"{url}/#job={finished}")
     expect(page.locator(".standing")).to_have_text(re.compile(r"Finishing; about \d+ seconds left\."))
