@@ -113,13 +113,16 @@ class Attempts:
 
     def _passed(self) -> WaitTimeout:
         """Return the error for a deadline that passed while nothing failed."""
-        advice = "Nothing was cancelled; call again, or use a longer timeout."
+        return WaitTimeout(f"The timeout of {self.timeout:g} s passed during {self.doing}. {self._advice}")
+
+    @property
+    def _advice(self) -> str:
         if self.doing == SUBMISSION:
-            advice = (
+            return (
                 "The job may have been accepted: look for it in the list of jobs, or submit again with the same idempotency_key, "
                 "which never makes a second job."
             )
-        return WaitTimeout(f"The timeout of {self.timeout:g} s passed during {self.doing}. {advice}")
+        return "Nothing was cancelled; call again, or use a longer timeout."
 
     def bounding(self, on_bytes: OnBytes | None) -> OnBytes:
         """Return `on_bytes` as a callback that raises `WaitTimeout` once the deadline has passed, in the middle of a body."""
@@ -170,7 +173,7 @@ class Attempts:
         if now + pause >= self.deadline:
             raise WaitTimeout(
                 f"The timeout of {self.timeout:g} s passed during {self.doing}; the last error was: "
-                f"{fault or type(fault).__name__}. Call again, or use a longer timeout."
+                f"{fault or type(fault).__name__}. {self._advice}"
             ) from fault
         return pause
 

@@ -68,7 +68,8 @@ class Followers:
             `after` is not the id of an event.
         """
         watcher = self._watchers.get(id)
-        if watcher is None or watcher.failure is not None:  # a client that reads nothing keeps a failed one alive
+        # A client that reads nothing keeps one alive that failed, or whose job ended and was replaced by another with its id.
+        if watcher is None or watcher.failure is not None or watcher.ended:
             watcher = self._watchers[id] = _Watcher()
         watcher.listeners += 1
         try:

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import hashlib
 import os
 import socket
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import httpx
 import pytest
 from pliant.schemas.job import Status
-from pliant.service.app import STATUS_OF
+from pliant.service.app import STATUS_OF, create_app
 from pliant.service.settings import MB
 from pliant.service.spool import Incoming
 from pliant.worker import errors
 from pliant.worker.errors import InvalidSetting, StoreUnavailable
+from pliant.worker.formats.records import Limits
 from pliant.worker.records import utc_now
 from pliant.worker.store.blobs import Blobs
 from serving import Running, Serve, finish, settings_from, submit, until
@@ -157,6 +160,22 @@ def test_a_body_that_is_not_json_is_described(http: httpx.Client) -> None:
         422,
         "JSON (EOF while parsing a value at line 1 column 8)",
     )
+
+
+@pytest.mark.parametrize(("gibibytes", "parse"), [(3, 3), (8, 4)])
+def test_parsing_one_file_gets_no_more_memory_than_reading(running: Running, gibibytes: int, parse: int) -> None:
+    settings = replace(running.jobs.settings, read_memory=gibibytes << 30)
+    app = create_app(
+        replace(running.jobs, settings=settings), running.app.state.service.settings, tokens=running.tokens
+    )
+
+    async def limits() -> Limits:
+        async with app.router.lifespan_context(app):
+            found: Limits = app.state.service.limits
+            return found
+
+    found = asyncio.run(limits())
+    assert (found.read_memory, found.parse_memory) == (gibibytes << 30, parse << 30)
 
 
 @pytest.mark.parametrize("path", ["/healthz", "/readyz?exclude=workers"])

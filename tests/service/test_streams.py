@@ -146,6 +146,34 @@ def test_a_client_that_reads_nothing_keeps_no_failure_alive(
     assert asyncio.run(followed()) is Status.SUCCEEDED
 
 
+def test_a_new_job_under_the_id_of_one_that_ended_is_followed(running: Running, http: httpx.Client) -> None:
+    def put() -> None:
+        http.put("/v1/jobs/again-1", files=form(name="again")).raise_for_status()
+
+    async def followed() -> Status:
+        followers = Followers()
+        await asyncio.to_thread(put)
+        async with aclosing(followers.follow(running.jobs, "again-1")) as stalled:
+            await anext(stalled)
+            await asyncio.to_thread(finish, running, "again-1", b"result")
+            async with asyncio.timeout(15):
+                while not followers._watchers["again-1"].ended:
+                    await asyncio.sleep(0.01)
+            reader = followers._reader  # it must not read between the deletion and the new job
+            assert reader is not None
+            followers._stop_reader()
+            await asyncio.to_thread(reader.join)
+            await asyncio.to_thread(running.jobs.delete, "again-1")
+            await asyncio.to_thread(put)
+            waiting = asyncio.create_task(followers.wait(running.jobs, "again-1", 15))
+            await asyncio.sleep(0.5)
+            assert not waiting.done()
+            await asyncio.to_thread(finish, running, "again-1", b"result")
+            return (await waiting).status
+
+    assert asyncio.run(followed()) is Status.SUCCEEDED
+
+
 def test_followers_are_removed_when_their_client_disconnects(restless: Running) -> None:
     service = restless.app.state.service
     with httpx.Client(base_url=restless.url, timeout=10) as http:

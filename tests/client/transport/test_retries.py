@@ -269,6 +269,8 @@ def test_a_submission_that_times_out_may_have_been_accepted(clock: Clock) -> Non
     client = client_of(service, clock)
     with pytest.raises(WaitTimeout, match=r"may have been accepted.*idempotency_key"):
         client.submit(POINTS, timeout=3, idempotency_key="once")
+    with pytest.raises(WaitTimeout, match=r"last error was.*may have been accepted"):
+        client_of(Flaky(*[answer(503)] * 99), clock).submit(POINTS, timeout=3)
     job = client.submit(POINTS, idempotency_key="once")
     assert [other.id for other in client.list()] == [job.id]
     job.wait(timeout=9)
