@@ -67,8 +67,10 @@ def steps_left(
 
     Parameters
     ----------
-    last, before : float
-        Relative decrease of the objective in the last step and in the one before; `before` is None after the first step.
+    last : float
+        Relative decrease of the objective in the last step.
+    before : float or None
+        The same in the step before; None after the first step.
     taken : int
         Steps so far.
     tolerance : float

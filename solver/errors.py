@@ -16,7 +16,7 @@ from pliant.schemas.invalid import Invalid
 
 if TYPE_CHECKING:
     import numpy as np
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
 
 class SolverError(Exception):
@@ -43,6 +43,40 @@ class InvalidSettings(InvalidInput):
 def wrong_input(field: str, code: str, expected: str, got: str, hint: str) -> InvalidInput:
     """Return the error for an invalid input; all arguments are required and therefore positional."""
     return InvalidInput(code, field=field, expected=expected, got=got, hint=hint)
+
+
+def numeric(value: ArrayLike, field: str, hint: str, *, kinds: str = "fiu") -> NDArray[np.generic]:
+    """Return an input as an array, masked entries as NaN.
+
+    Parameters
+    ----------
+    value : array_like
+        The input.
+    field : str
+        Name of the input, for the error.
+    hint : str
+        What the user can do, for the error.
+    kinds : str
+        Kinds of dtype that are accepted, of ``b`` (bool), ``f`` (float), ``i`` and ``u`` (integers).
+
+    Raises
+    ------
+    InvalidInput
+        The input is a list of rows of different lengths, or its numbers are of another kind.
+    """
+    import numpy as np
+
+    try:
+        masked = isinstance(value, np.ma.MaskedArray)
+        array = np.ma.filled(np.ma.asarray(value, dtype=float), np.nan) if masked else np.asarray(value)
+    except (TypeError, ValueError):
+        raise wrong_input(
+            field, "wrong_type", "a rectangular array of numbers", f"a {type(value).__name__} that is none", hint
+        ) from None
+    if array.dtype.kind not in kinds:
+        expected = "integers" if "f" not in kinds else "bool or numbers" if "b" in kinds else "real numbers"
+        raise wrong_input(field, "wrong_type", expected, f"dtype {array.dtype}", hint)
+    return array
 
 
 def shape_text(array: NDArray[np.generic]) -> str:

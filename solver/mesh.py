@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pliant.solver.errors import shape_text, wrong_input
+from pliant.solver.errors import numeric, shape_text, wrong_input
 from pliant.solver.records import Ints, read_only
 
 
@@ -32,13 +32,12 @@ class Mesh:
         InvalidInput
             Not an integer array of 3 or 4 columns, an index out of range, or a face that repeats a vertex.
         """
-        given = np.asarray(faces)
+        hint = "Convert the faces to int32."
+        given = numeric(faces, "mesh.faces", hint)
         if given.size == 0:
             given = np.zeros((0, 3), dtype=np.int32)
-        if given.dtype.kind not in "iu":
-            raise wrong_input(
-                "mesh.faces", "wrong_type", "integers", f"dtype {given.dtype}", "Convert the faces to int32."
-            )
+        if given.dtype.kind == "f":
+            raise wrong_input("mesh.faces", "wrong_type", "integers", f"dtype {given.dtype}", hint)
         if given.ndim != 2 or given.shape[1] not in (3, 4):
             raise wrong_input(
                 "mesh.faces", "wrong_shape", "(faces, 3) or (faces, 4)", shape_text(given),
@@ -74,13 +73,13 @@ class Mesh:
         InvalidInput
             Not a two-dimensional integer array, or an index from 0 to P−1 is missing or repeated.
         """
-        given = np.asarray(grid)
-        if given.dtype.kind not in "iu" or given.ndim != 2:
+        given = numeric(grid, "mesh.grid", "Give the point index of every cell, −1 for holes.")
+        if given.dtype.kind == "f" or given.ndim != 2:
             raise wrong_input(
                 "mesh.grid", "wrong_shape", "an integer array (rows, columns)", f"{given.dtype} {shape_text(given)}",
                 "Give the point index of every cell, −1 for holes.",
             )  # fmt: skip
-        present = given[given >= 0]
+        present = given[given != -1]
         if present.size == 0 or not np.array_equal(np.sort(present), np.arange(present.size)):
             raise wrong_input(
                 "mesh.grid", "index_out_of_range", f"each index from 0 to {max(present.size - 1, 0)} exactly once",

@@ -32,8 +32,10 @@ class Monitor:
 
     Parameters
     ----------
-    on_step, should_stop : callable, optional
-        Callbacks of the user.
+    on_step : callable, optional
+        The user's; called with the progress.
+    should_stop : callable, optional
+        The user's; returns True to stop the solve.
     plan : sequence of Stage
         Expected stages of the solve, in order.
     descent : Descent, optional

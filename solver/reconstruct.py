@@ -55,8 +55,8 @@ def solve(
     should_stop : callable, optional
         Called between units of work; once it returns True, the solve ends with `Outcome.STOPPED` and the last shapes.
     scratch : path, optional
-        Folder for a temporary file that holds the result if it exceeds `limits.BLOCK_OBSERVATIONS` and is therefore solved in blocks of
-        points; None holds it in memory. The file is deleted with the result.
+        Folder for a temporary file that holds a result of more than 10 million frames times points (`limits.BLOCK_OBSERVATIONS`), which is
+        solved in blocks of points; None holds it in memory. The file is deleted with the result.
 
     Raises
     ------

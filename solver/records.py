@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pliant.solver.errors import shape_text, wrong_input
+from pliant.solver.errors import numeric, shape_text, wrong_input
 from pliant.solver.limits import frame_chunks
 from pliant.solver.storage import allocated, let_go
 
@@ -44,7 +44,7 @@ class Tracks:
         Parameters
         ----------
         points : array_like, shape (F, P, 2)
-            NaN or infinity in either coordinate marks the observation as hidden.
+            NaN, infinity or the mask of a masked array in either coordinate marks the observation as hidden.
         visible : array_like, shape (F, P), optional
             Bool or confidence in [0, 1].
         scratch : path, optional
@@ -58,11 +58,7 @@ class Tracks:
         InvalidInput
             Wrong shape or type, F < 3, P < 4, confidence outside [0, 1], or no visible observation.
         """
-        given = np.asarray(points)
-        if given.dtype.kind not in "fiu":
-            raise wrong_input(
-                "tracks", "wrong_type", "real numbers", f"dtype {given.dtype}", "Convert the array to float."
-            )
+        given = numeric(points, "tracks", "Convert the array to float.")
         if given.ndim != 3 or given.shape[2] != 2:
             raise wrong_input(
                 "tracks", "wrong_shape", "(frames, points, 2)", shape_text(given), "Transpose or reshape the array."
@@ -148,6 +144,12 @@ class Camera:
         nearer = 1 + self.depths(shapes) / self.focal
         return np.asarray(self.principal_point + (image - self.principal_point) / nearer[..., None])
 
+    def centred_on(self, origins: Floats) -> Camera:
+        """Return cameras that project `shapes - origins[:, None]` to where these cameras project shapes; origins `(F, 3)`, world units."""
+        points = origins[:, None]
+        nearer = 1.0 if self.focal is None else 1 + self.depths(points)[:, 0] / self.focal
+        return replace(self, scales=self.scales / nearer, translations=self.project(points)[:, 0])
+
     def at(self, frames: slice) -> Camera:
         """Return the cameras of the given frames."""
         return replace(
@@ -194,18 +196,21 @@ class KnownCamera:
         Raises
         ------
         InvalidInput
-            Wrong shape, not finite, rows not orthonormal to within 1e-3, or a scale or focal length that is not positive.
+            Wrong type or shape, not finite, rows not orthonormal and right-handed to within 1e-3, or a scale or focal length that is not
+            positive.
         """
         if focal is not None and not (np.isfinite(focal) and focal > 0):
             raise wrong_input(
                 "cameras.focal", "out_of_range", "a positive, finite length", str(focal), "Give it in the tracks' unit."
             )
-        if principal_point is not None and not np.isfinite(principal_point).all():
+        if principal_point is not None and not (
+            np.shape(principal_point) == (2,) and np.isfinite(np.asarray(principal_point, dtype=np.float64)).all()
+        ):
             raise wrong_input(
                 "cameras.principal_point", "not_finite", "two finite numbers", str(principal_point), "Give x and y."
             )
-        given = np.asarray(rotations, dtype=np.float64)
-        if given.ndim != 3 or given.shape[1:] not in ((2, 3), (3, 3)):
+        given = numeric(rotations, "rotations", "Give one rotation a frame.").astype(np.float64)
+        if given.ndim != 3 or given.shape[1:] not in ((2, 3), (3, 3)) or len(given) == 0:
             raise wrong_input(
                 "rotations",
                 "wrong_shape",
@@ -223,7 +228,15 @@ class KnownCamera:
             )  # fmt: skip
         left, _, right = np.linalg.svd(rows, full_matrices=False)
         rows = left @ right
-        complete = np.concatenate([rows, np.cross(rows[:, 0], rows[:, 1])[:, None]], axis=1)
+        third = np.cross(rows[:, 0], rows[:, 1])
+        if given.shape[1] == 3 and not np.abs(given[:, 2] - third).max() <= 1e-3:
+            mirrored = np.abs(given[:, 2] + third).max() <= 1e-3
+            raise wrong_input(
+                "rotations", "not_a_rotation", "a third row that is the cross product of the first two",
+                "its negative: the determinants are -1" if mirrored else "another row",
+                "Leave out the third row, shape (frames, 2, 3), if the axes are left-handed.",
+            )  # fmt: skip
+        complete = np.concatenate([rows, third[:, None]], axis=1)
         read_only(complete)
         factors = None if scales is None else _positive_scales(scales, len(given))
         return cls(complete, factors, focal, principal_point)
@@ -274,12 +287,19 @@ class Choices:
     """Values chosen automatically, with reasons for the report."""
 
     basis_size: int
+    """K of the factorization."""
     temporal_weight: float
+    """λ1, dimensionless."""
     spatial_weight: float
+    """λ2, dimensionless."""
     robust_scale: float
+    """ε of the smoothed L1 or δ of Huber, normalized units."""
     temporal_order: int
+    """Order of the difference operator H."""
     low_rank_weight: float
+    """λ3, dimensionless."""
     laplacian: str
+    """Laplacian used: `grid8`, `uniform` or `cotangent`."""
     unit: float
     """RMS radius of the centred tracks, the tracks' unit: one normalized unit."""
     noise: float
@@ -299,11 +319,14 @@ class Choices:
 
 
 def _positive_scales(scales: ArrayLike, frames: int) -> Floats:
-    factors = np.array(scales, dtype=np.float64)
-    if factors.shape != (frames,) or not np.isfinite(factors).all() or not (factors > 0).all():
-        raise wrong_input(
-            "scales", "wrong_shape", f"{frames} positive numbers", shape_text(factors), "Give one scale a frame."
-        )
+    hint = "Give one scale a frame."
+    factors = np.array(numeric(scales, "scales", hint), dtype=np.float64)
+    if factors.shape != (frames,):
+        raise wrong_input("scales", "wrong_shape", f"{frames} numbers", shape_text(factors), hint)
+    if not (np.isfinite(factors) & (factors > 0)).all():
+        smallest = float(factors.min())
+        got = "a value that is not finite" if not np.isfinite(factors).all() else f"{smallest:.3g}"
+        raise wrong_input("scales", "out_of_range", "positive, finite numbers", got, hint)
     read_only(factors)
     return factors
 
@@ -313,11 +336,7 @@ def _confidence(visible: ArrayLike | None, shape: tuple[int, int], scratch: str 
     if visible is None:
         confidence[...] = 1.0
         return confidence
-    given = np.asarray(visible)
-    if given.dtype.kind not in "bfiu":
-        raise wrong_input(
-            "visibility", "wrong_type", "bool or numbers", f"dtype {given.dtype}", "Convert the array to bool."
-        )
+    given = numeric(visible, "visibility", "Convert the array to bool.", kinds="bfiu")
     if given.shape != shape:
         raise wrong_input(
             "visibility",

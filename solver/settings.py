@@ -12,8 +12,10 @@ the deformation is isotropic, and H and λ3 are not used.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import radians, tan
+from numbers import Integral, Real
 from typing import Literal
 
 from pliant.solver.errors import InvalidSettings
@@ -140,6 +142,7 @@ class Settings:
         return self.camera != "orthographic"
 
     def __post_init__(self) -> None:
+        self._check_types()
         check_pinhole(self)
         _check_choice("method", self.method, Method)
         _check_choice("camera", self.camera, CameraModel)
@@ -169,8 +172,39 @@ class Settings:
                 "order", "prior gaussian with method robust and preset auto beside order any",
                 f"prior {self.prior}, method {self.method}, preset {self.preset}", "The other priors compare neighbouring frames.",
             )  # fmt: skip
+        if self.surface == "isometric" and self.camera in ("orthographic", "scaled_orthographic"):
+            raise _contradiction(
+                "surface", f"auto or free beside camera {self.camera}", "'isometric'",
+                "An isometric surface is found from its perspective. Leave out one of the two.",
+            )  # fmt: skip
         if not 0 <= self.seed < 2**32:
             raise _out_of_range("seed", "a whole number from 0 to 4294967295", self.seed)
+
+    def _check_types(self) -> None:
+        for name in ("basis_size", "temporal_order", "max_reweightings", "seed"):
+            value = getattr(self, name)
+            if not (isinstance(value, Integral) or (value is None and name in ("basis_size", "temporal_order"))):
+                raise _out_of_range(name, "a whole number", value)
+        for name in (
+            "temporal_weight",
+            "spatial_weight",
+            "low_rank_weight",
+            "robust_scale",
+            "tolerance",
+            "focal",
+            "field_of_view",
+        ):
+            value = getattr(self, name)
+            if not (isinstance(value, Real) or (value is None and name != "tolerance")):
+                raise _out_of_range(name, "a number", value)
+        for name in ("image_size", "principal_point"):
+            value = getattr(self, name)
+            if value is not None and not (
+                isinstance(value, Iterable) and all(isinstance(each, Real) for each in value)
+            ):
+                raise _out_of_range(name, "two numbers, or None", value)
+        if self.y_up not in (True, False):
+            raise _out_of_range("y_up", "True or False", self.y_up)
 
 
 MAX_CENTRE_DISTANCE = 10.0

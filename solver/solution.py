@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from pliant.solver.records import Camera, Choices, Floats, Ints
+from pliant.solver.records import Camera, Choices, Floats, Ints, read_only
 
 if TYPE_CHECKING:
     from pliant.solver.evaluation.trust import Trust
@@ -16,9 +16,16 @@ class Outcome(StrEnum):
     """How a solve ended; `sentence` explains each member."""
 
     CONVERGED = "converged"
+    """The objective changed by less than the tolerance."""
+
     MAX_REWEIGHTINGS = "max_reweightings"
+    """The maximum number of reweightings was reached first. The result is usable."""
+
     REJECTED = "rejected"
+    """The last step increased the objective; the shapes are those before it."""
+
     STOPPED = "stopped"
+    """The caller asked for it; the shapes are those of the last finished step."""
 
     @property
     def sentence(self) -> str:
@@ -53,6 +60,10 @@ class Trace:
     iterations: Ints
     """Inner conjugate-gradient iterations."""
 
+    def __post_init__(self) -> None:
+        for array in (self.objective, self.residual, self.iterations):
+            read_only(array)
+
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Solution:
@@ -71,8 +82,14 @@ class Solution:
     """Final IRLS weight relative to its maximum, in [0, 1], shape `(F, P)`; 0 where hidden, small for outliers."""
 
     trace: Trace
+    """History of the reweightings."""
+
     outcome: Outcome
+    """How the solve ended."""
+
     choices: Choices
+    """Values chosen automatically, with reasons and warnings."""
+
     seconds: dict[str, float]
     """Wall time per stage."""
 

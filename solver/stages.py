@@ -113,8 +113,10 @@ def planned(
 
     Parameters
     ----------
-    frames, points : int
-        Size of the tracks.
+    frames : int
+        F.
+    points : int
+        P.
     gaussian : bool
         Whether the prior is learned.
     known_cameras : bool

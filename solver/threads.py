@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import operator
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -26,10 +27,12 @@ def threads_limited(count: int | None) -> Iterator[None]:
 
     Raises
     ------
+    TypeError
+        `count` is not a whole number.
     ValueError
         `count` is below 1.
     """
-    if count is not None and count < 1:
+    if count is not None and operator.index(count) < 1:
         raise ValueError(f"expected at least 1 thread, got {count}; None uses every core that the process may use")
     before = _LIMIT.set(count)
     try:

@@ -141,8 +141,15 @@ def centred(points: Floats) -> Floats:
     return np.asarray(points - points.mean(axis=1, keepdims=True))
 
 
-def depths_of(depth: Floats | DepthMap, views: Floats, curvature: float, *, start: Floats | None = None) -> Floats:
-    """Return posterior mean depths of the sampled points, mean 0 in every frame, shape `(F, P)`.
+def depths_of(
+    depth: Floats | DepthMap,
+    views: Floats,
+    curvature: float,
+    *,
+    start: Floats | None = None,
+    origin: Floats | None = None,
+) -> Floats:
+    """Return posterior mean depths of points, shape `(F, P)`, relative to their mean in every frame or to `origin`.
 
     Parameters
     ----------
@@ -154,12 +161,24 @@ def depths_of(depth: Floats | DepthMap, views: Floats, curvature: float, *, star
         κ.
     start : array, shape (F, P), optional
         Depths to start the fixed point from; 0 without it.
+    origin : array, shape (F, 1), optional
+        From `mean_depth`, for some of the points: their own mean would be another origin than that of the others.
     """
     depths = np.zeros(views.shape[:2]) if start is None else start
     for _ in range(DEPTH_STEPS if curvature else 1):
-        depths = depth @ columns(centred(corrected(views, depths, curvature)))
-        depths -= depths.mean(axis=1, keepdims=True)
+        images = corrected(views, depths, curvature)
+        if origin is None:
+            depths = depth @ columns(centred(images))
+            depths -= depths.mean(axis=1, keepdims=True)
+        else:
+            depths = depth @ columns(images) - origin
     return depths
+
+
+def mean_depth(view: Perspective) -> Floats:
+    """Return the mean of D w over the sample, shape `(F, 1)`: the origin of its depths, and of those of all other points."""
+    images = _corrected_by(view, view.sample)
+    return np.asarray(view.depth @ columns(images.mean(axis=1, keepdims=True)))
 
 
 def corrected(views: Floats, depths: Floats, curvature: float) -> Floats:
@@ -199,8 +218,9 @@ def corrected_moments(view: Perspective, normalized: Normalized) -> tuple[Floats
     """
     frames = len(normalized.points)
     gram, total, used = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2)), 0
+    origin = mean_depth(view)
     for _, points in spans(normalized, view.filling):
-        changed = _corrected_by(view, points + view.offsets[:, None]) - view.offsets[:, None]
+        changed = _corrected_by(view, points + view.offsets[:, None], origin) - view.offsets[:, None]
         stacked = columns(changed)
         gram += stacked @ stacked.T
         total += changed.sum(axis=1)
@@ -210,16 +230,16 @@ def corrected_moments(view: Perspective, normalized: Normalized) -> tuple[Floats
     return gram / used - np.outer(flat, flat), mean, centred(_corrected_by(view, view.sample))
 
 
-def _corrected_by(view: Perspective, views: Floats) -> Floats:
-    return corrected(views, depths_of(view.depth, views, view.curvature), view.curvature)
+def _corrected_by(view: Perspective, views: Floats, origin: Floats | None = None) -> Floats:
+    return corrected(views, depths_of(view.depth, views, view.curvature, origin=origin), view.curvature)
 
 
 def posterior_depths(view: Perspective, normalized: Normalized) -> Floats:
     """Return the depth of every point and frame, shape `(F, P)`; 0 for points that no frame shows."""
-    found = np.zeros(normalized.visible.shape)
+    found, origin = np.zeros(normalized.visible.shape), mean_depth(view)
     for places, points in spans(normalized, view.filling):
         views = points + view.offsets[:, None]
-        found[:, places] = depths_of(view.depth, views, view.curvature)
+        found[:, places] = depths_of(view.depth, views, view.curvature, origin=origin)
     return found
 
 

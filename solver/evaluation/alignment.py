@@ -51,8 +51,10 @@ def align(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -> Align
 
     Parameters
     ----------
-    shapes, truth : array_like, shape (F, P, 3)
-        Reconstruction and ground truth, any unit (the same one, unless `kind` is `frame_similarity`).
+    shapes : array_like, shape (F, P, 3)
+        Reconstruction, any unit.
+    truth : array_like, shape (F, P, 3)
+        Ground truth, any unit (that of `shapes`, unless `kind` is `frame_similarity`).
     kind : {'sequence', 'frame', 'frame_scaled', 'frame_similarity'}
         `sequence`: one matrix of O(3) for the sequence, minimising `Σ_f ‖S_f Qᵀ − G_f‖²`.
         `frame`: a rotation per frame, and for the sequence a mirror or none, whichever fits better.

@@ -81,8 +81,10 @@ def coverage(shapes_std: ArrayLike, shapes: ArrayLike, truth: ArrayLike) -> floa
     ----------
     shapes_std : array_like, shape (F, P)
         Standard deviations, the unit of the shapes.
-    shapes, truth : array_like, shape (F, P, 3)
-        Reconstruction and ground truth.
+    shapes : array_like, shape (F, P, 3)
+        Reconstruction.
+    truth : array_like, shape (F, P, 3)
+        Ground truth.
 
     Raises
     ------
@@ -147,8 +149,10 @@ def rotation_degrees(rotations: ArrayLike, truth: ArrayLike) -> float:
 
     Parameters
     ----------
-    rotations, truth : array_like, shape (F, 3, 3)
-        Camera from world.
+    rotations : array_like, shape (F, 3, 3)
+        Estimated cameras, camera from world.
+    truth : array_like, shape (F, 3, 3)
+        True cameras, camera from world.
 
     Raises
     ------
@@ -175,8 +179,10 @@ def evaluate(
 
     Parameters
     ----------
-    solution, tracks
-        Result and input of the solve.
+    solution : Solution
+        Result of the solve.
+    tracks : Tracks
+        Its input.
     truth : array_like, shape (F, P, 3), optional
         Ground truth shapes, the tracks' unit, in one world frame. If they are in each frame's camera axes, the metrics with one alignment
         for the sequence, `e3d_sequence` and `e3d_mocap`, are not meaningful.
@@ -184,6 +190,11 @@ def evaluate(
         Ground truth cameras.
     true_focal : float, optional
         Ground truth focal length, the tracks' unit.
+
+    Returns
+    -------
+    dict of str to float
+        Value of each metric.
 
     Raises
     ------

@@ -52,8 +52,13 @@ class Verdict(StrEnum):
     """Whether a result can be used."""
 
     GOOD = "good"
+    """Nothing speaks against it."""
+
     WITH_CARE = "with_care"
+    """The reasons say what may be wrong."""
+
     DO_NOT_USE = "do_not_use"
+    """The reasons say why depth or shape is probably wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +66,8 @@ class Trust:
     """Estimated accuracy of a result."""
 
     verdict: Verdict
+    """Whether the result can be used."""
+
     reasons: tuple[str, ...]
     """Sentences with figures that explain why the verdict is not `good`, the most serious first."""
 

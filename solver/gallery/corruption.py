@@ -15,6 +15,19 @@ def corrupt(
 ) -> Sequence:
     """Corrupt the tracks of a sequence as `corrupt_tracks` does; the truth is unchanged and `outliers` marks the outliers.
 
+    Parameters
+    ----------
+    sequence : Sequence
+        Clean or already corrupted sequence.
+    noise : float
+        Standard deviation of the noise, relative to the largest coordinate.
+    outliers : float
+        Share of the observations moved to random positions.
+    hidden : float
+        Share of the observations to hide.
+    seed : int
+        Seed of noise, outliers and hidden observations.
+
     Raises
     ------
     InvalidInput
@@ -31,7 +44,7 @@ def corrupt_tracks(
 
     Parameters
     ----------
-    tracks
+    tracks : Tracks
         Clean or already corrupted tracks.
     noise : float
         r, for Gaussian noise of standard deviation `σ = r · max |W|` on every coordinate, W the tracks with every frame's
@@ -45,8 +58,10 @@ def corrupt_tracks(
 
     Returns
     -------
-    tracks, outliers
-        Corrupted tracks, and a mask of their visible outliers, `(F, P)`.
+    tracks : Tracks
+        Corrupted tracks.
+    outliers : ndarray of bool, shape (F, P)
+        Mask of their visible outliers.
 
     Raises
     ------

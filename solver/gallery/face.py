@@ -44,17 +44,21 @@ def face(
 
     Parameters
     ----------
-    num_frames, num_points
-        F and P.
-    degrees, tilt
-        The camera turns from −degrees to +degrees and nods by ±tilt.
-    scale_change
+    num_frames : int
+        F, number of frames.
+    num_points : int
+        P, number of points.
+    degrees : float
+        The camera turns about the vertical from −degrees to +degrees.
+    tilt : float
+        The camera nods by ±tilt degrees.
+    scale_change : float
         Amplitude of the change of the logarithm of the scale.
-    mesh
+    mesh : str
         "grid": a pixel grid cut to an oval; "triangles": an irregular triangulation.
-    self_occlusion
+    self_occlusion : bool
         Hide points whose surface faces away from the camera; occlusion of the cheek by the nose is not modelled.
-    seed
+    seed : int
         Seed of the order and strength of the expressions.
 
     Raises

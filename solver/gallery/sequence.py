@@ -24,7 +24,11 @@ class Sequence:
     """A synthetic sequence: `tracks = scales · shapes · rotations[:, :2]ᵀ + translation` exactly, unless corrupted."""
 
     tracks: Tracks
+    """F frames of P points, pixels."""
+
     mesh: Mesh
+    """Mesh of the points."""
+
     shapes: Floats
     """True shapes, `(F, P, 3)`, world axes, pixels."""
 
@@ -35,6 +39,8 @@ class Sequence:
     """True scales, `(F,)`; the mean logarithm is 0."""
 
     name: str
+    """Name of the surface, such as `face`."""
+
     outliers: NDArray[np.bool_]
     """Mask of the observations that `corrupt` replaced by outliers, `(F, P)`."""
 
@@ -73,8 +79,10 @@ def film(
         Name of the sequence.
     surface
         Function of the time in [0, 1] that returns the points, `(P, 3)`, model units, image axes.
-    mesh, rotations
-        Mesh of the points; cameras, `(F, 3, 3)`.
+    mesh
+        Mesh of the points.
+    rotations
+        Cameras, `(F, 3, 3)`, camera from world.
     scale_change
         Amplitude c of one sinusoidal period in the logarithm of the scale: the size in the image varies by e^±c.
     self_occlusion

@@ -27,15 +27,19 @@ def sphere(
 
     Parameters
     ----------
-    num_frames, num_points
-        F and P.
-    degrees, tilt
-        The camera turns from −degrees to +degrees and nods by ±tilt.
-    scale_change
+    num_frames : int
+        F, number of frames.
+    num_points : int
+        P, number of points.
+    degrees : float
+        The camera turns about the vertical from −degrees to +degrees.
+    tilt : float
+        The camera nods by ±tilt degrees.
+    scale_change : float
         Amplitude of the change of the logarithm of the scale.
-    self_occlusion
+    self_occlusion : bool
         Hide points whose surface faces away from the camera.
-    seed
+    seed : int
         Seed of the lobes.
 
     Raises

@@ -24,11 +24,13 @@ def talk(num_frames: int = 300, num_points: int = 300, *, mesh: Kind = "grid", s
 
     Parameters
     ----------
-    num_frames, num_points
-        F and P.
-    mesh
+    num_frames : int
+        F, number of frames.
+    num_points : int
+        P, number of points.
+    mesh : str
         "grid" or "triangles".
-    seed
+    seed : int
         Seed of the phases.
 
     Raises

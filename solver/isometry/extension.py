@@ -96,16 +96,22 @@ def extend(
 
     Parameters
     ----------
-    tracks, seen : shapes (F, P, 2) and (F, P)
-        Image positions, and a mask of the visible ones.
-    images, known : shapes (F, A, 2) and (F, A)
-        Image positions of the anchors, and a mask of the visible ones.
-    anchors : shape (F, A, 3)
+    tracks : array, shape (F, P, 2)
+        Image positions, pixels.
+    seen : array of bool, shape (F, P)
+        Mask of the visible ones.
+    images : array, shape (F, A, 2)
+        Image positions of the anchors, pixels.
+    known : array of bool, shape (F, A)
+        Mask of the visible ones.
+    anchors : array, shape (F, A, 3)
         Anchors in camera axes, without gaps.
-    template : shape (A, 2)
+    template : array, shape (A, 2)
         Template positions of the anchors, see `flatten`.
-    focal, centre
-        Focal length and principal point `(2,)`, pixels.
+    focal : float
+        Focal length, pixels.
+    centre : array, shape (2,)
+        Principal point, pixels.
     """
     place = _placed(tracks, seen, images, known, template)
     placed: NDArray[np.bool_] = np.asarray(np.isfinite(place).all(axis=1))

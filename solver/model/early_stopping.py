@@ -60,8 +60,10 @@ def learn_with_early_stopping(
     ----------
     sample : array, shape (F, S, 2)
         Sampled points of centred, complete tracks, normalized units; held out only if they are all points and fewer than 2F.
-    gram, projections
-        As for `pliant.solver.model.expectation_maximisation.learned`.
+    gram : array, shape (2F, 2F)
+        W Wᵀ / P of centred, complete tracks, normalized units.
+    projections : array, shape (F, 2, 3)
+        s_f times the first two rows of R_f.
     model_order : ModelOrder
         Maximum number of modes, and the starting noise.
     seed : int

@@ -73,8 +73,10 @@ def learned(
 
     Parameters
     ----------
-    gram, projections
-        As for `begin`.
+    gram : array, shape (2F, 2F)
+        W Wᵀ / P of centred, complete tracks, normalized units.
+    projections : array, shape (F, 2, 3)
+        s_f times the first two rows of R_f.
     max_modes : int
         Maximum number of columns of L.
     noisy_start : bool

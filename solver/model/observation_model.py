@@ -205,8 +205,12 @@ def inlier_probabilities(
         S.
     noise : float
         σ².
-    points, confidence, weight
-        As for `ImageDensity.left_out`.
+    points : array, shape (F, P, 2)
+        Observations, 0 where hidden.
+    confidence : array, shape (F, P)
+        v, 0 where hidden.
+    weight : array, shape (F, P)
+        vπ, the weight of an observation in the predictions of the others.
     share : float
         α to start from.
     """

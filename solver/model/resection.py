@@ -181,8 +181,10 @@ def resected(
         Shapes of the same points.
     start : Poses
         Starting poses. If `turning`, frames also start at the best pose of the mean shape; the more probable result is returned.
-    turning, with_scales : bool
-        False keeps the rotations or the scales, respectively.
+    turning : bool
+        False keeps the rotations.
+    with_scales : bool
+        False keeps the scales.
     should_stop : callable, optional
         Called between groups of frames; once it returns True, the remaining frames keep their starting poses.
     """

@@ -22,6 +22,9 @@ Matrix = sparse.csr_array[Any]
 STRENGTH = 12.0
 """Factor that scales the mean of the neighbours minus the vertex, h²∇²/4 for neighbours in all directions, to 3 h²∇²."""
 
+SMALLEST = float(np.finfo(np.float64).tiny)
+"""Floor of an area in a division: a face whose corners coincide has cotangent 0."""
+
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 """The paper's four second-difference filters: along a row, along a column, along both diagonals."""
 
@@ -166,7 +169,8 @@ def _cotangent_weights(mesh: Mesh, reference: Floats) -> Floats:
         at, one, two = (triangles[:, (corner + step) % 3] for step in range(3))
         u, v = reference[one] - reference[at], reference[two] - reference[at]
         cross = np.linalg.norm(np.cross(u, v), axis=1)
-        cotangent = np.einsum("ij,ij->i", u, v) / np.maximum(cross, 1e-12 * np.maximum((u * u).sum(1), (v * v).sum(1)))
+        longest = np.maximum((u * u).sum(1), (v * v).sum(1))
+        cotangent = np.einsum("ij,ij->i", u, v) / np.maximum(cross, np.maximum(1e-12 * longest, SMALLEST))
         edge = np.minimum(one, two).astype(np.int64) * mesh.num_points + np.maximum(one, two)
         place = np.searchsorted(keys, edge)
         place[place == len(keys)] = 0
@@ -174,7 +178,7 @@ def _cotangent_weights(mesh: Mesh, reference: Floats) -> Floats:
         np.add.at(total, place[known], cotangent[known] / 2)
     # Obtuse or degenerate triangles have negative or vanishing weights, which would amplify roughness.
     typical = float(np.median(np.abs(total))) or 1.0
-    return np.clip(np.nan_to_num(total, nan=typical), 0.01 * typical, 100 * typical)
+    return np.clip(total, 0.01 * typical, 100 * typical)
 
 
 def _assemble(rows: NDArray[Any], columns: NDArray[Any], values: Floats, num_points: int) -> Matrix:

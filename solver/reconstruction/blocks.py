@@ -158,14 +158,19 @@ def _changes(cameras: Cameras, prior: Prior | None, monitor: Monitor) -> Changes
 
 
 def blocks(tracks: Tracks, count: int) -> list[NDArray[np.intp]]:
-    """Return the sorted indices of the points of each block; block sizes differ by at most one.
+    """Return the sorted indices of the points of each block; block sizes differ by at most two.
 
     The points are bisected across the longer side of their mean image positions, recursively, so that blocks are about as wide as high and
-    have short borders.
+    have short borders. Points that no frame shows have no position: they are dealt to all blocks, since a block of them alone has no data.
     """
-    total = np.maximum(tracks.visible.sum(axis=0), np.finfo(float).tiny)
-    mean = np.einsum("fp,fpc->pc", tracks.visible, tracks.points) / total[:, None]
-    return [np.sort(part) for part in _divided(np.arange(tracks.num_points), mean, count)]
+    total = tracks.visible.sum(axis=0)
+    mean = np.einsum("fp,fpc->pc", tracks.visible, tracks.points)
+    seen, never = np.flatnonzero(total), np.flatnonzero(total == 0)
+    mean[seen] /= total[seen, None]
+    count = min(count, len(seen))
+    return [
+        np.sort(np.concatenate([part, never[number::count]])) for number, part in enumerate(_divided(seen, mean, count))
+    ]
 
 
 def _divided(points: NDArray[np.intp], mean: Floats, count: int) -> list[NDArray[np.intp]]:
@@ -245,17 +250,14 @@ class _Whole:
         )
 
     def solution(self, *, seconds: dict[str, float]) -> Solution:
-        """Return the solution of all points, centred per frame where the cameras are orthographic."""
-        first, camera = self._parts[0], self._parts[0].camera
-        if camera.focal is None:
-            middle = np.zeros((len(self._shapes), 3))
-            for shape, mean in zip(self._shapes, middle, strict=True):
-                pulse()
-                mean[:] = shape.mean(axis=0)
-                shape -= mean
-            moved = camera.scales[:, None] * np.einsum("fij,fj->fi", camera.rotations[:, :2], middle)
-            camera = replace(camera, translations=camera.translations + moved)
-        for array in (self._shapes, camera.translations, *self._others.values()):
+        """Return the solution of all points, centred per frame."""
+        first, middle = self._parts[0], np.zeros((len(self._shapes), 3))
+        for shape, mean in zip(self._shapes, middle, strict=True):
+            pulse()
+            mean[:] = shape.mean(axis=0)
+            shape -= mean
+        camera = first.camera.centred_on(middle)
+        for array in (self._shapes, camera.scales, camera.translations, *self._others.values()):
             read_only(array)
         let_go(self._shapes)
         order = (Outcome.STOPPED, Outcome.REJECTED, Outcome.MAX_REWEIGHTINGS, Outcome.CONVERGED)

@@ -52,14 +52,10 @@ class Cameras:
     stopped: bool
     """Whether a stop was requested; the cameras are then the best so far."""
 
-    estimate: CameraEstimate
-    """Internal: the cameras in normalized units."""
-
-    data: LearningData | None
-    """Internal: data for learning the prior; None unless `settings.prior` is `gaussian`."""
-
-    observations: Observations
-    """Internal: the tracks in normalized units."""
+    # For the following stages only, and without docstrings, so that they are not in the reference.
+    estimate: CameraEstimate  # the cameras in normalized units
+    data: LearningData | None  # for learning the prior; None unless `settings.prior` is `gaussian`
+    observations: Observations  # the tracks in normalized units
 
     def __repr__(self) -> str:
         lens = "orthographic" if self.camera.focal is None else f"focal length {self.camera.focal:.4g}"

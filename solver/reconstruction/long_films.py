@@ -42,8 +42,10 @@ def extended(
 
     Parameters
     ----------
-    estimate, covariance
-        Cameras and prior of the frames used, in the same axes.
+    estimate
+        Cameras of the frames used.
+    covariance
+        Prior of the frames used, in the same axes.
     used : array of int, shape (F',)
         Indices of the frames used, increasing.
     observations : Observations

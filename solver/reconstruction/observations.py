@@ -124,7 +124,7 @@ def check_fit(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None, se
     InvalidInput
         Number of vertices (code `mesh_mismatch`) or of cameras (`camera_mismatch`).
     InvalidSettings
-        `laplacian="grid8"` with a mesh that is not a grid.
+        `laplacian="grid8"` with a mesh that is not a grid, or `camera="orthographic"` with given scales that are not 1.
     """
     if mesh is not None and mesh.num_points != tracks.num_points:
         raise InvalidInput(
@@ -140,6 +140,12 @@ def check_fit(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None, se
         raise InvalidInput(
             "camera_mismatch", field="rotations", expected=f"{tracks.num_frames} rotations, one for each frame of the tracks",
             got=f"{len(cameras.rotations)}", hint="Pass one camera per frame, in the order of the frames.",
+        )  # fmt: skip
+    scales = None if cameras is None else cameras.scales
+    if scales is not None and settings.camera == "orthographic" and not np.allclose(scales, 1):
+        raise InvalidSettings(
+            "invalid_option", field="options.camera", expected="auto, scaled_orthographic or perspective beside given scales",
+            got="'orthographic'", hint="Orthographic cameras have scale 1. Choose another model, or leave the scales out.",
         )  # fmt: skip
 
 

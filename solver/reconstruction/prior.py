@@ -35,11 +35,9 @@ class Prior:
     stopped: bool
     """Whether a stop was requested; the prior is then the best so far."""
 
-    normalized: ShapeCovariance
-    """Internal: the covariance in normalized units."""
-
-    estimate: CameraEstimate
-    """Internal: the cameras that the prior was learned with."""
+    # For the following stages only, and without docstrings, so that they are not in the reference.
+    normalized: ShapeCovariance  # the covariance in normalized units
+    estimate: CameraEstimate  # the cameras that the prior was learned with
 
     def __repr__(self) -> str:
         frames, modes = self.normalized.modes.shape

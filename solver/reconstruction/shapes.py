@@ -118,7 +118,8 @@ def _finished(
     solution = finish(problem, history, outcome, normalized=normalized, estimate=estimate, choices=choices)
     history[-1] = history[-1].summary()
     if estimate.perspective is not None:
-        solution = seen_in_perspective(solution, tracks, estimate.perspective, normalized.unit, start.kept)
+        centre = start.kept if problem.moving else None
+        solution = seen_in_perspective(solution, tracks, estimate.perspective, normalized.unit, centre)
     confidence = np.asarray(problem.confidence, dtype=np.float64)
     monitor()
     solution = with_inlier_probability(

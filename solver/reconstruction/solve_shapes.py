@@ -40,7 +40,7 @@ def solve_shapes(
 ) -> Solution:
     """Solve for the shape of every frame: the last stage of `solve`.
 
-    Gross outliers are rejected. More than `limits.BLOCK_OBSERVATIONS` frames times points are solved in blocks of points.
+    Gross outliers are rejected. More than 10 million frames times points (`limits.BLOCK_OBSERVATIONS`) are solved in blocks of points.
 
     Parameters
     ----------

@@ -86,8 +86,16 @@ def find_outliers(
 
     Parameters
     ----------
-    tracks, cameras, prior, mesh, settings
-        As for `solve_shapes`.
+    tracks : Tracks
+        Tracks over the frames of the cameras.
+    cameras : Cameras
+        From `estimate_cameras`.
+    prior : Prior
+        From `learn_prior`.
+    mesh : Mesh, optional
+        Which points are neighbours; None for no smoothness in space.
+    settings : Settings, optional
+        Method, loss, weights; None uses the settings of the cameras.
     on_step : callable, optional
         Called after units of work.
     should_stop : callable, optional

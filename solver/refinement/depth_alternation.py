@@ -88,8 +88,16 @@ def factorized_again(
     ----------
     gram : array, shape (2F, 2F)
         W Wᵀ / P of the corrected tracks, divided by the scales.
-    view, found, used, model_order, should_stop
-        As for `alternated`. The factorizations are aligned to the world axes and the sign of depth of `found`.
+    view : Perspective
+        κ, and the sample at all frames.
+    found : Learned
+        Cameras and covariance, at the frames used. The factorizations are aligned to their world axes and sign of depth.
+    used : array of int, shape (F',)
+        Indices of the frames used.
+    model_order : ModelOrder
+        Maximum number of modes, and the starting noise.
+    should_stop : callable, optional
+        Called between factorizations; once it returns True, the best so far is returned.
     """
     places = evenly_spread(len(used), COMPARED_FRAMES)
     some = used[places]

@@ -93,8 +93,10 @@ def search(
     ----------
     views : array, shape (F, S, 2)
         Complete tracks of sampled points, relative to the principal point, normalized units.
-    rotations, scales : arrays, shapes (F, 3, 3) and (F,)
+    rotations : array, shape (F, 3, 3)
         Cameras found under orthography.
+    scales : array, shape (F,)
+        Their scales.
     view : Perspective
         Given parameters. The `curvature` returned has the sign opposite to `signs[0]` if depths must be mirrored.
     model_order : ModelOrder

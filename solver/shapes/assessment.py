@@ -46,8 +46,10 @@ def assessed(
         The tracks that were solved.
     confidence : ndarray, shape (F, P)
         Confidence of the observations used; 0 where hidden or rejected.
-    estimate, covariance
-        Cameras and prior of the solve. Without a covariance no standard deviations are computed.
+    estimate
+        Cameras of the solve.
+    covariance
+        Prior of the solve. Without one no standard deviations are computed.
     unit : float
         The tracks' unit per normalized unit.
     turning : bool

@@ -5,8 +5,8 @@ the area A that the tracks cover about their frames' centroids. With a share α 
 
     P(inlier | r) = (1 − α) p(r) / ((1 − α) p(r) + α / A).
 
-For an observation of confidence v the density is p(r) = v² / (2 s²) exp(−√2 v (|r_x| + |r_y|) / s) with the loss `l1`, whose smoothed
-absolute value is the negative logarithm of a Laplace density of standard deviation s, and p(r) = v / (2π s²) exp(−v |r|² / 2s²) with
+For an observation of confidence v the density is `p(r) = v² / (2 s²) exp(−√2 v (|r_x| + |r_y|) / s)` with the loss `l1`, whose smoothed
+absolute value is the negative logarithm of a Laplace density of standard deviation s, and `p(r) = v / (2π s²) exp(−v |r|² / 2s²)` with
 the other losses. s is the larger of two standard deviations: that of the noise assumed by the solve (`Choices.noise`), and that of the
 residuals, which exceeds it if the model does not fit: their confidence-weighted median length over √(2 ln 2). If n of N visible
 observations are rejected, α = (n + 1) / (N + 2), the mean under a uniform prior (Laplace's rule of succession).
@@ -96,8 +96,8 @@ def inlier_probability(
         Standard deviation of an image coordinate, in the unit of the residuals.
     extent : ndarray, shape (2,)
         Width and height of the area of the outliers, in the same unit.
-    loss : {"l1", "l2", "huber"}
-        Selects the density of the inliers.
+    loss : str
+        ``"l1"``, ``"l2"`` or ``"huber"``. Selects the density of the inliers.
     """
     seen, found = confidence > 0, np.full(confidence.shape, np.nan)
     used = seen & ~rejected

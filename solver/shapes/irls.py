@@ -29,6 +29,8 @@ NEGLIGIBLE = 0.1
 """Decrease of the energy that an inner solve may leave, relative to the decrease that ends the reweightings."""
 MAX_INNER = 60
 """Maximum number of conjugate gradient iterations per reweighting."""
+ROUNDING = float(np.finfo(np.float64).eps)
+"""Energy, normalized units, below which the fit is exact: that of a single residual of the size of a rounding error under the L1 loss."""
 SINGLE_REDUCTION = 1e-3
 """Smallest relative residual of an inner solve, and the smallest for which single precision is used."""
 
@@ -116,10 +118,12 @@ def terminate(before: State, after: State, *, tolerance: float, max_reweightings
     """Return the outcome of the solve, or None to continue; `after` is the step before `no_higher` is applied.
 
     Converged if the objective changes by at most `tolerance`, relative, over one reweighting; rejected if it rises by more.
+    Changes of the objective of an exact fit are rounding.
     """
-    if after.objective - before.objective > tolerance * abs(before.objective):
+    negligible = tolerance * max(abs(before.objective), ROUNDING)
+    if after.objective - before.objective > negligible:
         return Outcome.REJECTED
-    if before.objective - after.objective <= tolerance * abs(before.objective):
+    if before.objective - after.objective <= negligible:
         return Outcome.CONVERGED
     if after.reweighting >= max_reweightings:
         return Outcome.MAX_REWEIGHTINGS

@@ -27,10 +27,14 @@ def corrected_again(
 
     Parameters
     ----------
-    problem, state
-        Problem and state of the points `kept`.
-    normalized, flat : Normalized
-        The original tracks, and their latest correction.
+    problem
+        Problem of the points `kept`.
+    state
+        Its state.
+    normalized : Normalized
+        The original tracks.
+    flat : Normalized
+        Their latest correction.
     estimate : CameraEstimate
         κ and the cameras.
     kept : array of int, optional

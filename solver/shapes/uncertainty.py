@@ -164,8 +164,12 @@ def bounded_by_neighbours(std: Floats, shapes: Floats, visible: Floats) -> Float
 
     Parameters
     ----------
-    std, shapes, visible
-        Shapes `(F, P)`, `(F, P, 3)` and `(F, P)`.
+    std : array, shape (F, P)
+        Standard deviations, the unit of the shapes.
+    shapes : array, shape (F, P, 3)
+        Positions of the points.
+    visible : array, shape (F, P)
+        Confidence, 0 where hidden.
     """
     often = np.flatnonzero((visible > 0).mean(axis=0) >= WELL_OBSERVED_SHARE)
     rarely = np.setdiff1d(np.arange(shapes.shape[1]), often)

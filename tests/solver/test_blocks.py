@@ -83,6 +83,40 @@ def test_solving_in_blocks_matches_solving_at_once(film: gallery.Sequence, setti
     assert fractions[-1] == 1
 
 
+def test_cameras_of_blocks_with_sparsely_observed_points_see_the_tracks_in_perspective(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen = gallery.face(6, 60)
+    away = np.einsum("fpi,fi->fp", seen.shapes, seen.rotations[:, 2])
+    image = np.einsum("fpi,fci->fpc", seen.shapes, seen.rotations[:, :2])
+    size = np.sqrt(np.square(seen.shapes).sum(axis=2).mean())
+    focal = 4 * size
+    visible = np.ones(away.shape)
+    visible[1:, :12] = 0
+    tracks = Tracks.from_arrays(image / (1 + away / focal)[..., None], visible)
+    cameras = KnownCamera.from_arrays(seen.rotations, focal=focal, principal_point=(0.0, 0.0))
+    monkeypatch.setattr(blocks, "BLOCK_OBSERVATIONS", 6 * 20)
+    solution = solve(tracks, seen.mesh, cameras=cameras, settings=Settings(order="film"))
+    assert solution.camera.focal == pytest.approx(focal)
+    left = np.linalg.norm(solution.camera.project(solution.shapes) - tracks.points, axis=2)
+    assert left[visible > 0] == pytest.approx(solution.residuals[visible > 0], abs=1e-9)
+    assert np.median(left[visible > 0]) < 3e-3 * size
+    assert solution.shapes.mean(axis=1) == pytest.approx(np.zeros((6, 3)), abs=1e-9)
+
+
+@pytest.mark.usefixtures("limited")
+def test_points_that_no_frame_shows_are_dealt_to_all_blocks(film: gallery.Sequence) -> None:
+    visible = np.ones((FRAMES, POINTS))
+    visible[:, : POINTS // 2] = 0
+    tracks = Tracks.from_arrays(film.tracks.points, visible)
+    parts = blocks.blocks(tracks, 3)
+    assert sorted(np.concatenate(parts)) == list(range(POINTS))
+    assert [len(part) for part in parts] == [POINTS // 3] * 3
+    assert all((part >= POINTS // 2).sum() == POINTS // 6 for part in parts)
+    solution = solve(tracks, None, cameras=given(film), settings=Settings(prior="smooth", max_reweightings=2))
+    assert np.isfinite(solution.shapes).all()
+
+
 @pytest.mark.usefixtures("limited")
 def test_a_stop_between_blocks_returns_finite_shapes(film: gallery.Sequence) -> None:
     asked = 0

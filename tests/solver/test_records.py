@@ -35,6 +35,14 @@ class TestTracks:
         assert np.isfinite(tracks.points).all()
         assert not tracks.all_visible
 
+    def test_masked_coordinates_hide_the_observation(self) -> None:
+        masked = np.ma.array(POINTS.copy(), mask=np.zeros(POINTS.shape, dtype=bool))
+        masked[1, 2, 0] = np.ma.masked
+        masked.data[1, 2] = 1e5
+        tracks = Tracks.from_arrays(masked)
+        assert tracks.visible[1, 2] == 0
+        assert tracks.visible.sum() == tracks.visible.size - 1
+
     def test_fractional_confidence_is_kept_and_zero_is_hidden(self) -> None:
         visible = np.full((5, 6), 0.25)
         visible[4] = 0
@@ -111,6 +119,7 @@ class TestMesh:
             ([[0, 1, 4]], "index_out_of_range"),
             ([[0, 1, 2], [-1, 2, 3]], "index_out_of_range"),
             ([[0, 1, 2], [1, 1, 3]], "degenerate_face"),
+            ([[0, 1, 2], [1, 2]], "wrong_type"),
         ],
     )
     def test_invalid_faces_are_rejected(self, faces: Any, code: str) -> None:
@@ -125,6 +134,8 @@ class TestMesh:
             ([[0, 1], [1, 2]], "index_out_of_range"),
             ([[0, 1], [3, 4]], "index_out_of_range"),
             ([[-1, -1]], "index_out_of_range"),
+            ([[0, -5], [1, 2]], "index_out_of_range"),
+            ([[0, 1], [2]], "wrong_type"),
         ],
     )
     def test_invalid_grids_are_rejected(self, grid: Any, code: str) -> None:
@@ -154,13 +165,26 @@ class TestKnownCamera:
             (np.tile(np.eye(3) * 1.1, (4, 1, 1)), None, "rotations", "not_a_rotation"),
             (np.full((4, 2, 3), np.nan), None, "rotations", "not_a_rotation"),
             (np.tile(np.eye(3), (4, 1, 1)), np.ones(3), "scales", "wrong_shape"),
-            (np.tile(np.eye(3), (4, 1, 1)), np.zeros(4), "scales", "wrong_shape"),
-            (np.tile(np.eye(3), (4, 1, 1)), np.full(4, np.inf), "scales", "wrong_shape"),
+            (np.tile(np.eye(3), (4, 1, 1)), np.zeros(4), "scales", "out_of_range"),
+            (np.tile(np.eye(3), (4, 1, 1)), np.full(4, np.inf), "scales", "out_of_range"),
+            (np.zeros((0, 3, 3)), None, "rotations", "wrong_shape"),
+            ([[1, 0, 0], [0, 1]], None, "rotations", "wrong_type"),
+            (np.tile(np.eye(3) + 0j, (4, 1, 1)), None, "rotations", "wrong_type"),
+            (np.tile(np.diag([1, 1, 7]), (4, 1, 1)), None, "rotations", "not_a_rotation"),
         ],
     )
     def test_invalid_cameras_are_rejected(self, rotations: Any, scales: Any, field: str, code: str) -> None:
         error = refusal(KnownCamera.from_arrays, rotations, scales)
         assert (error.field, error.code) == (field, code)
+
+    def test_left_handed_rotations_are_named(self) -> None:
+        error = refusal(KnownCamera.from_arrays, np.tile(np.diag([1.0, 1.0, -1.0]), (4, 1, 1)))
+        assert (error.code, error.got) == ("not_a_rotation", "its negative: the determinants are -1")
+
+    @pytest.mark.parametrize("point", [(1, 2, 3), 5.0, (np.nan, 1)])
+    def test_a_principal_point_has_two_coordinates(self, point: Any) -> None:
+        error = refusal(KnownCamera.from_arrays, np.tile(np.eye(3), (4, 1, 1)), principal_point=point)
+        assert (error.field, error.code) == ("cameras.principal_point", "not_finite")
 
 
 class TestSettings:
@@ -184,6 +208,18 @@ class TestSettings:
             {"max_reweightings": 0},
             {"tolerance": 1.0},
             {"seed": -1},
+            {"seed": 1.5},
+            {"basis_size": 2.5},
+            {"max_reweightings": 2.5},
+            {"max_reweightings": None},
+            {"temporal_weight": "a"},
+            {"focal": "x"},
+            {"image_size": 5},
+            {"image_size": "ab"},
+            {"principal_point": 5},
+            {"y_up": "no"},
+            {"surface": "isometric", "camera": "orthographic"},
+            {"surface": "isometric", "camera": "scaled_orthographic"},
         ],
         ids=str,
     )

@@ -32,6 +32,21 @@ def error(found: np.ndarray, truth: np.ndarray) -> float:
     return float(np.mean(np.linalg.norm(found - truth, axis=(1, 2)) / np.linalg.norm(truth, axis=(1, 2))))
 
 
+def test_given_scales_contradict_an_orthographic_camera() -> None:
+    _, rotations, tracks, mesh = scene()
+    cameras = KnownCamera.from_arrays(rotations, np.linspace(0.5, 2, len(rotations)))
+    with pytest.raises(InvalidSettings, match="Orthographic cameras have scale 1"):
+        solve(tracks, mesh, cameras=cameras, settings=Settings(camera="orthographic"))
+
+
+def test_an_exact_fit_has_converged() -> None:
+    _, rotations, tracks, _ = scene()
+    settings = Settings(method="temporal", temporal_weight=0.0)
+    found = solve(tracks, None, cameras=cameras_of(rotations), settings=settings)
+    assert found.outcome is Outcome.CONVERGED
+    assert not found.trace.objective.flags.writeable
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_gives_finite_centred_shapes_that_explain_the_tracks(method: str) -> None:
     _, rotations, tracks, mesh = scene()

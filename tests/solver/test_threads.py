@@ -61,6 +61,11 @@ def test_a_limit_below_one_thread_is_rejected() -> None:
         pass
 
 
+def test_a_limit_that_is_not_whole_is_rejected() -> None:
+    with pytest.raises(TypeError), threads_limited(1.5):  # type: ignore[arg-type]
+        pass
+
+
 def test_the_result_does_not_depend_on_the_number_of_threads(many_cores: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         normal_equations, "SMALLEST", 1, raising=False

@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 from pliant.solver import Camera, InvalidInput, InvalidSettings, KnownCamera, Settings, Solution, Tracks, gallery, solve
 from pliant.solver.cameras.lens import given_lens
-from pliant.solver.cameras.perspective import Candidate, Perspective, corrected, density, depth_map, depths_of, mirrored
+from pliant.solver.cameras.perspective import (
+    Candidate,
+    Perspective,
+    corrected,
+    corrected_moments,
+    density,
+    depth_map,
+    depths_of,
+    mirrored,
+    posterior_depths,
+)
 from pliant.solver.evaluation.metrics import e3d_frame_scaled, focal_error, reprojection
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
@@ -17,6 +27,7 @@ from pliant.solver.reconstruction.camera_report import described, improbable
 from pliant.solver.refinement.focal_length import corrected_energy
 from pliant.solver.refinement.learned import Learned, motion_of
 from pliant.solver.shapes import perspective_shapes
+from pliant.solver.tracks import completion
 from pliant.solver.tracks.normalization import normalize
 
 PICTURE = (1280.0, 720.0)
@@ -53,6 +64,36 @@ def a_camera(*, y_up: bool = False) -> Camera:
         exponential(0.3 * random.normal(size=(5, 3))), random.uniform(0.8, 1.2, 5), random.normal(size=(5, 2)) * 50,
         400.0, 1.0, np.array([20.0, -10.0]), y_up,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("chunk", [7, 25])
+def test_corrected_tracks_do_not_depend_on_the_size_of_chunks(chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    random, normalized = np.random.default_rng(7), normalize(pinhole(SEEN, FOCAL))
+    covariance = ShapeCovariance(np.eye(3), np.eye(3), 0.1 * random.normal(size=(len(SEEN), 2)), 1e-4, 1e-4, 0.0)
+    offsets = (normalized.centroid - CENTRE) / normalized.unit
+    view = Perspective(
+        offsets, CENTRE, curvature=normalized.unit / FOCAL, sample=normalized.points[:, ::3] + offsets[:, None],
+        depth=depth_map(FACE.rotations, np.ones(len(SEEN)), covariance),
+    )  # fmt: skip
+    assert normalized.points.shape[1] < completion.POINTS_PER_CHUNK
+    gram, middle, _ = corrected_moments(view, normalized)
+    depths = posterior_depths(view, normalized)
+    monkeypatch.setattr(completion, "POINTS_PER_CHUNK", chunk)
+    assert posterior_depths(view, normalized) == pytest.approx(depths, abs=1e-12)
+    other, moved, _ = corrected_moments(view, normalized)
+    assert other == pytest.approx(gram, abs=1e-12)
+    assert moved == pytest.approx(middle, abs=1e-12)
+    assert depths[:, ::3] == pytest.approx(depths_of(view.depth, view.sample, view.curvature), abs=1e-3)
+
+
+@pytest.mark.parametrize("y_up", [False, True])
+@pytest.mark.parametrize("focal", [None, 400.0])
+def test_shapes_about_another_origin_project_to_the_same_pixels(y_up: bool, focal: float | None) -> None:
+    camera = replace(a_camera(y_up=y_up), focal=focal)
+    random = np.random.default_rng(3)
+    shapes, origins = random.normal(size=(5, 20, 3)) * 40, random.normal(size=(5, 3)) * 30
+    moved = camera.centred_on(origins).project(shapes - origins[:, None])
+    assert moved == pytest.approx(camera.project(shapes), abs=1e-9)
 
 
 @pytest.mark.parametrize("y_up", [False, True])

@@ -34,6 +34,15 @@ def test_rounding_to_the_current_precision_changes_nothing() -> None:
     assert laplacian.matrix.indices.dtype == np.int32
 
 
+def test_faces_whose_corners_coincide_get_the_smallest_cotangent_weight() -> None:
+    mesh = triangulated(sheet()[1])
+    reference = np.random.default_rng(5).standard_normal((mesh.num_points, 3))
+    reference[mesh.faces[0]] = 0
+    built = build_laplacian(mesh, "cotangent", reference)
+    assert built is not None
+    assert np.isfinite(built.matrix.toarray()).all()
+
+
 @pytest.mark.parametrize(("frames", "together"), [(1, 1), (3, 1), (10, 3), (32, 8), (800, 8)])
 def test_few_frames_leave_work_for_every_thread(frames: int, together: int) -> None:
     assert frames_together(frames) == together
