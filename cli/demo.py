@@ -181,17 +181,18 @@ def report(
     screen.print(table)
     show_warnings(job.warnings)
     if not good:
-        err().print("[bold red]The errors are too large.[/] Please report this with the output of `pliant doctor`.")
+        advice = " Please report this with the output of `pliant doctor`."
+        err().print(Text.assemble(("The errors are too large.", "bold red"), advice))
     for path in paths.values():
-        screen.print(f"  {path}  {path.stat().st_size / 1e6:.2f} MB", markup=False)
+        screen.print(f"  {path}  {path.stat().st_size / 1e6:.2f} MB")
     for line in verdict_lines(job):
         screen.print(line)
     glb = paths.get("shapes.glb")
-    screen.print(f"Open {glb} in Blender or any glTF viewer: it plays." if glb is not None else "", markup=False)
+    screen.print(f"Open {glb} in Blender or any glTF viewer: it plays." if glb is not None else "")
     if url is None:
         screen.print("To see it in the browser: pliant demo --keep. For your own films: pliant up.")
     else:
-        screen.print(f"[bold]The page:[/] {url}  [dim](Ctrl-C stops it)[/]")
+        screen.print(Text.assemble(("The page:", "bold"), f" {url}  ", ("(Ctrl-C stops it)", "dim")))
 
 
 @contextmanager

@@ -131,13 +131,16 @@ def check_packages(version_of: Callable[[str], str] = version) -> Iterator[Findi
             missing.append(name)
     if len(missing) > 0:
         yield Finding(
-            "packages", "bad", f"missing: {', '.join(missing)}", "Reinstall: pip install --force-reinstall pliant"
+            "packages",
+            "bad",
+            f"missing: {', '.join(missing)}",
+            "Reinstall: pip install --force-reinstall . in Pliant's source folder",
         )
     else:
         yield Finding("packages", "good", ", ".join(held))
     absent = missing_modules()
     if absent:
-        advice = "Only needed to run a service: pip install 'pliant[server]'"
+        advice = "Only needed to run a service: pip install '.[server]' in Pliant's source folder"
         yield Finding("server", "note", f"missing: {', '.join(absent)}", advice)
     else:
         yield Finding("server", "good", ", ".join(f"{name} {version_of(name)}" for name in SERVER))

@@ -14,7 +14,9 @@ class MissingExtra(Exception):
     code = "missing_extra"
 
     def __init__(self, command: str) -> None:
-        super().__init__(f"{command} needs the service, which is not installed: pip install 'pliant[server]'")
+        super().__init__(
+            f"{command} needs the service, which is not installed: pip install '.[server]' in Pliant's source folder"
+        )
 
 
 def missing_modules() -> list[str]:

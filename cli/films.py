@@ -119,12 +119,13 @@ def solve_film(
     from pliant.worker.films.tracker import check_film, described, film_options
     from pliant.worker.settings import usable_cores
 
-    source, checked = FilmSource(film, region), checked_options(options)
+    checked = checked_options(options)
+    source = FilmSource(film, region, own_rate="fps" in checked.model_fields_set)
     facts = check_film(source, checked)
     checked = film_options(checked, facts)
     printed = [] if as_json else warnings_of_check(facts, region, checked)
     if not as_json:
-        out().print(described(facts, checked).notes[0], markup=False, highlight=False)
+        out().print(described(facts, checked).notes[0])
         show_warnings(printed)
     with (
         tempfile.TemporaryDirectory(prefix="pliant-film-") as scratch,

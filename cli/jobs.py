@@ -178,7 +178,7 @@ def result(
         print_json({name: str(path) for name, path in paths.items()})
         return
     for path in paths.values():
-        out().print(str(path), markup=False)
+        out().print(str(path))
 
 
 def list_jobs(
@@ -210,7 +210,7 @@ def log(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) 
         print_json(lines)
         return
     for line in lines:
-        out().print(line, markup=False)
+        out().print(line)
 
 
 def cancel(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) -> None:

@@ -26,7 +26,7 @@ UNESTIMATED = "The error is not estimated"
 
 
 def out() -> Console:
-    """Console on standard output; created per call, so that it follows redirections."""
+    """Console on standard output; created per call, so that it follows redirections. Brackets in names and messages are no markup."""
     return Console(highlight=False, soft_wrap=True)
 
 
@@ -76,9 +76,9 @@ def show_fault(fault: BaseException, sentence: str, code: Exit, *, as_json: bool
     for choice in details.get("choices", ()):
         options = " ".join(f"-O {name}={value}" for name, value in choice.get("options", {}).items())
         evidence = f" ({choice['evidence']})" if "evidence" in choice else ""
-        screen.print(f"  {choice.get('layout', '')}{evidence}: {options}", markup=False)
+        screen.print(f"  {choice.get('layout', '')}{evidence}: {options}")
     if more is not None:
-        screen.print(f"More about this error: {more}", markup=False)
+        screen.print(f"More about this error: {more}")
 
 
 def explained_at(details: Mapping[str, Any], url: str | None) -> str | None:
@@ -140,7 +140,7 @@ def show_job(job: Job, *, as_json: bool) -> None:
     if job.metrics:
         screen.print(metrics_table(job.metrics))
     for artifact in job.artifacts:
-        screen.print(f"  {artifact.name}  {artifact.bytes / 1e6:.2f} MB  {artifact.description}", markup=False)
+        screen.print(f"  {artifact.name}  {artifact.bytes / 1e6:.2f} MB  {artifact.description}")
     for line in verdict_lines(job):
         screen.print(line)
 

@@ -46,7 +46,7 @@ def solve(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Reconstruct tracks or a film in this process, without a service. The output files are the same."""
+    """Reconstruct tracks or a film in this process, without a service. It writes the same files as a job."""
     ctx.obj.json = as_json
     one_numerical_thread()  # the first check of a path imports NumPy
     check_inputs(tracks, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=region)
@@ -164,9 +164,9 @@ def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:
     show_warnings(done.warnings)
     screen.print(metrics_table(done.metrics))
     for artifact in done.artifacts:
-        screen.print(f"{output / artifact.name}  {artifact.bytes / 1e6:.2f} MB", markup=False)
+        screen.print(f"{output / artifact.name}  {artifact.bytes / 1e6:.2f} MB")
     if done.camera_sentence is not None:
-        screen.print(done.camera_sentence, markup=False)
+        screen.print(done.camera_sentence)
     for line in verdict_lines(done) or [Text(done.sentence)]:
         screen.print(line)
 

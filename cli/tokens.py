@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,6 +17,7 @@ from pliant.cli.up import Data, chosen
 
 if TYPE_CHECKING:
     from pliant.worker.tokens import Token, Tokens
+    from rich.table import Table
 
 MB = 2**20
 
@@ -86,7 +87,7 @@ def create(
         )
     if source is not None and not as_json:
         state = "was revoked and stays so; put another one into the file" if token.revoked else "is registered"
-        err().print(f"Token {token.id} for {token.name} {state}.", markup=False)
+        err().print(f"Token {token.id} for {token.name} {state}.")
         return
     if as_json:
         print_json({**shown(token), "token": text})
@@ -100,7 +101,6 @@ def _show_once(token: Token, text: str) -> None:
     err().print(
         f"Token {token.id} for {token.name}: {', '.join(token.scopes)}; {until}. It is shown only once; "
         "its user sets PLIANT_TOKEN to it.",
-        markup=False,
     )
 
 
@@ -113,11 +113,23 @@ def list_tokens(ctx: typer.Context, data: Data = None, as_json: Json = False) ->
     if as_json:
         print_json([shown(token) for token in found])
         return
-    from rich.table import Table
+    out().print(table_of(found))
 
-    table = Table("id", "name", "scopes", "created", "expires", "jobs of")
-    now = datetime.now(UTC)
-    for token in found:
+
+def table_of(tokens: Sequence[Token]) -> Table:
+    """Return the table of tokens; ids, which other commands take, stay complete on narrow terminals."""
+    from rich.table import Column, Table
+
+    now, longest = datetime.now(UTC), max((len(token.id) for token in tokens), default=0)
+    table = Table(
+        Column("id", no_wrap=True, min_width=longest),
+        "name",
+        "scopes",
+        "created",
+        "expires",
+        Column("jobs of", no_wrap=True),
+    )
+    for token in tokens:
         expires = "never" if token.expires_at is None else f"{token.expires_at:%Y-%m-%d %H:%M}"
         table.add_row(
             token.id,
@@ -127,7 +139,7 @@ def list_tokens(ctx: typer.Context, data: Data = None, as_json: Json = False) ->
             f"{expires} (expired)" if token.expired(now) else expires,
             "all" if token.sees_all else token.owner,
         )
-    out().print(table)
+    return table
 
 
 @app.command()
@@ -139,7 +151,7 @@ def revoke(ctx: typer.Context, id: TokenId, data: Data = None, as_json: Json = F
     if as_json:
         print_json(shown(token))
     else:
-        err().print(f"Token {token.id} ({token.name}) is revoked.", markup=False)
+        err().print(f"Token {token.id} ({token.name}) is revoked.")
 
 
 def shown(token: Token) -> dict[str, Any]:

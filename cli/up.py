@@ -98,13 +98,17 @@ def up(
 
 
 def _announce(url: str, settings: Settings, *, as_json: bool) -> None:
+    from rich.text import Text
+
     if as_json:
         print_json({"url": url, "data": str(settings.data.absolute()), "workers": settings.workers})
         sys.stdout.flush()
         return
     screen = out()
-    screen.print(f"[bold green]Pliant is ready[/]  {url}")
-    screen.print(f"[dim]data in {settings.data.absolute()}, {settings.workers} worker(s); Ctrl-C stops everything[/]")
+    screen.print(Text.assemble(("Pliant is ready", "bold green"), f"  {url}"))
+    screen.print(
+        Text(f"data in {settings.data.absolute()}, {settings.workers} worker(s); Ctrl-C stops everything", "dim")
+    )
 
 
 def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json: Json = False) -> None:

@@ -43,6 +43,7 @@ class Unreachable(PliantError):
     """No answer from the service, despite retries."""
 
     code = "unreachable"
+    """Stable machine-readable name."""
 
 
 class WaitTimeout(PliantError, TimeoutError):
@@ -59,6 +60,7 @@ class UnexpectedAnswer(PliantError):
     """
 
     code = "unexpected_answer"
+    """Stable machine-readable name."""
 
     def __init__(self, sentence: str, *, status: int | None = None) -> None:
         super().__init__(sentence)
@@ -69,6 +71,7 @@ class CorruptDownload(PliantError):
     """A file was downloaded twice and does not have the SHA-256 of the job's record."""
 
     code = "corrupt_download"
+    """Stable machine-readable name."""
 
 
 class BadArgument(PliantError, ValueError):

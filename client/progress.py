@@ -79,6 +79,11 @@ def progress_bar(console: Console | None = None, *, line_every: float | None = N
     line_every : float, optional
         Seconds between printed lines if there is no terminal; by default nothing is printed.
 
+    Yields
+    ------
+    Bar
+        The display; its methods are callbacks.
+
     Examples
     --------
     ``with progress_bar() as bar: client.submit(points, on_upload=bar.on_upload).wait(on_progress=bar.on_progress)``

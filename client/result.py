@@ -28,15 +28,13 @@ LOADED = (ARRAYS, REPORT)
 
 
 class Reconstruction:
-    """A job that succeeded, and its files in a local folder.
+    """A job that succeeded, and its files in a local folder."""
 
-    Attributes
-    ----------
-    job : Job
-        The final record: options, interpretation, metrics, warnings, artifacts.
-    folder : Path
-        Folder of the downloaded files; a temporary folder is removed together with this object.
-    """
+    job: Job
+    """The final record: options, interpretation, metrics, warnings, artifacts."""
+
+    folder: Path
+    """Folder of the downloaded files; a temporary folder is removed together with this object."""
 
     def __init__(self, job: Job, folder: Path | str | None) -> None:
         self.job = job

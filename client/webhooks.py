@@ -46,6 +46,11 @@ def verified(
     now : float, optional
         Current time in seconds since 1970; defaults to the system clock.
 
+    Returns
+    -------
+    Job
+        The finished job.
+
     Raises
     ------
     InvalidSignature

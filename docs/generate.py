@@ -2,10 +2,10 @@
 
     python docs/generate.py build/docs
 
-Markers: `options` (JSON schema of the job options), `settings` (environment variables), `cli` (the commands' help), `rest`
-(OpenAPI document), `errors` (table of error codes). A fence such as ``bash not-run: REASON`` becomes ``bash``, because Markdown
-renderers other than GitHub's treat a longer info string as text. The strict build that follows in `make docs` checks pages, links
-and anchors.
+Markers: `options` (JSON schema of the job options), `settings` (environment variables), `cli` (the commands' help), `rest`, `job`
+and `answers` (OpenAPI document), `records` (the SDK's records), `errors` (table of error codes). A fence such as
+``bash not-run: REASON`` becomes ``bash``, because Markdown renderers other than GitHub's treat a longer info string as text. The
+strict build that follows in `make docs` checks pages, links and anchors.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import ast
 import inspect
 import json
+import math
 import re
 import shutil
 import sys
@@ -31,6 +32,42 @@ ERROR_GROUPS = {
 }
 """Introductory sentences of groups of error codes."""
 
+OPTION_GROUPS = {
+    "Method": (
+        "method", "preset", "prior", "loss", "laplacian", "refine_rotations", "basis_size", "max_reweightings", "tolerance",
+        "precision", "seed", "time_limit",
+    ),
+    "Camera": ("camera", "focal", "field_of_view", "image_size", "principal_point"),
+    "Surface and order": ("surface", "order"),
+    "Weights": ("temporal_weight", "spatial_weight", "robust_scale", "temporal_order", "low_rank_weight"),
+    "Reading": ("layout", "rows", "coordinates", "coordinate_order", "y_axis", "visibility"),
+    "Selection": ("frames", "stride", "max_points", "min_seen"),
+    "Film": ("template_frame", "grid_step", "longest_side", "region_frame", "region_polygon"),
+    "Files": ("outputs", "fps", "normals", "colours", "axes", "glb_quantized", "glb_motion"),
+}  # fmt: skip
+"""Options by purpose, in the order of the page."""
+
+JOB_RECORDS = ("Job", "Status", "Progress", "FollowedPoints", "Interpretation", "Estimate", "Artifact")
+"""The record of a job, and those that it contains."""
+
+ANSWER_RECORDS = (
+    "JobPage", "Inspection", "Upload", "Share", "ServiceLimits", "ErrorCode", "Examples", "Example", "ExampleFile",
+)  # fmt: skip
+"""Records of the other answers."""
+
+SDK_RECORDS = ("Job", "Interpretation", "Progress", "Artifact", "Problem", "Share", "ServiceLimits")
+INNER = ("Estimate", "FollowedPoints")
+"""Records of the SDK: exported by `pliant.client`, and contained in those."""
+
+PAGES = {"Options": "options.md", "Problem": "errors.md", "ProblemCode": "errors.md"}
+"""Where the REST page links for schemas that have no table of their own."""
+
+SEVERAL = re.compile(r"^(boolean|integer|list|number|object|pair|string)\b")
+"""Words for types that have a plural."""
+
+BAR = re.compile(r"(`[^`]*`)|\|")
+"""A code span, or a bar, which would end the cell of a table."""
+
 NOTE = re.compile(r"^( *```\w+) not-run: .*$", re.MULTILINE)
 
 
@@ -46,15 +83,23 @@ def main(target: Path) -> None:
 
 
 def options() -> str:
-    """Return a section for every job option, from the JSON schema."""
+    """Return a section for every job option, from the JSON schema, grouped by purpose."""
     from pliant.schemas.options import Options
 
     properties = Options.model_json_schema()["properties"]
-    return "\n\n".join(
-        f"### {name}\n\n{field.get('description', '')}\n\n"
-        f"Type: {_type_of(field)}. Default: `{_plain(field.get('default'))}`."
-        for name, field in properties.items()
-    )
+    parts = []
+    for group, names in OPTION_GROUPS.items():
+        # The anchors #method and #camera belong to the options.
+        parts += [
+            f"## {group} {{ #{group.lower().replace(' ', '-')}-group }}",
+            *(_option(name, properties[name]) for name in names),
+        ]
+    return "\n\n".join(parts)
+
+
+def _option(name: str, field: dict[str, Any]) -> str:
+    about = f"Type: {_type_of(field)}. Default: `{_plain(field.get('default'))}`."
+    return f"### {name}\n\n{field.get('description', '')}\n\n{about}"
 
 
 def settings() -> str:
@@ -115,6 +160,54 @@ def rest() -> str:
     return "\n\n".join(parts)
 
 
+def job() -> str:
+    """Return a table of fields for the record of a job and for each record in it."""
+    return _tables(JOB_RECORDS)
+
+
+def answers() -> str:
+    """Return a table of fields for each record of the other answers."""
+    return _tables(ANSWER_RECORDS)
+
+
+def _tables(names: tuple[str, ...]) -> str:
+    """Return a section for each schema of the OpenAPI document."""
+    schemas, parts = openapi()["components"]["schemas"], []
+    for name in names:
+        schema = schemas[name]
+        known = schemas["Interpretation"]["properties"] if name == "Inspection" else {}
+        rows = [
+            (f"`{field}`", _linked(_type_of(each)), each.get("description", ""))
+            for field, each in schema.get("properties", {}).items()
+            if field not in known
+        ]
+        table = _table(("member", "type", "meaning"), rows) if rows else f"One of {_type_of(schema)}."
+        more = "The members of [Interpretation](#interpretation), and:\n\n" if known else ""
+        parts.append(f"### {name}\n\n{schema['description']}\n\n{more}{table}")
+    return "\n\n".join(parts)
+
+
+def _linked(words: str) -> str:
+    """Turn the names of schemas, in the words of a type, into links."""
+    return re.sub(r"`([A-Z]\w+)`", lambda found: f"[{found[1]}]({PAGES.get(found[1], f'#{found[1].lower()}')})", words)
+
+
+def records() -> str:
+    """Return an entry for each record of the SDK, with a table of its fields."""
+    from pliant import client
+    from pliant.schemas import job as of_job
+
+    parts = []
+    for home in (*(f"pliant.client.{name}" for name in SDK_RECORDS), *(f"pliant.schemas.job.{name}" for name in INNER)):
+        model = getattr(of_job if "schemas" in home else client, home.rpartition(".")[2])
+        rows = [
+            (f"`{name}`", f"`{model.__annotations__[name]}`", (field.description or "").replace("null", "None"))
+            for name, field in model.model_fields.items()
+        ]
+        parts.append(f"::: {home}\n    options:\n      members: false\n\n{_table(('field', 'type', 'meaning'), rows)}")
+    return "\n\n".join(parts)
+
+
 def openapi() -> dict[str, Any]:
     """Return the OpenAPI document of a service that was never started."""
     from pliant.service.app import create_app
@@ -146,12 +239,19 @@ def _operation(method: str, path: str, operation: dict[str, Any]) -> str:
     ]
     if parameters:
         lines.append(_table(("parameter", "in", "required", "meaning"), parameters))
-    answers = sorted(operation["responses"])
-    good = [status for status in answers if int(status) < 400]
-    lines.append(
-        f"Answers: {', '.join(good)}. Errors: {', '.join(status for status in answers if status not in good)}."
-    )
+    statuses = sorted(operation["responses"])
+    good = [status for status in statuses if int(status) < 400]
+    answered = ", ".join(f"{status}{_body(operation['responses'][status])}" for status in good)
+    lines.append(f"Answers: {answered}. Errors: {', '.join(status for status in statuses if status not in good)}.")
     return "\n\n".join(lines)
+
+
+def _body(response: dict[str, Any]) -> str:
+    """Return the type of an answer's body in brackets: a record, or the media types; nothing without a body."""
+    content = response.get("content", {})
+    words = _linked(_type_of(content.get("application/json", {}).get("schema", {})))
+    kinds = words if "](" in words else ", ".join(f"`{media}`" for media in content)
+    return f" ({kinds})" if kinds else ""
 
 
 def _scope(public: bool, scope: Any) -> str:
@@ -160,7 +260,7 @@ def _scope(public: bool, scope: Any) -> str:
 
 def _schema_note(parameter: dict[str, Any]) -> str:
     schema = parameter.get("schema", {})
-    return f"{parameter.get('description', schema.get('description', ''))} ({_type_of(schema)})"
+    return f"{parameter.get('description', schema.get('description', ''))} ({_linked(_type_of(schema))})"
 
 
 def _command(command: Any, path: str) -> Iterator[str]:
@@ -180,7 +280,7 @@ def _command(command: Any, path: str) -> Iterator[str]:
         if parameter.name == "help" or getattr(parameter, "hidden", False):
             continue
         named = parameter.param_type_name == "argument"
-        shown = str(parameter.name).upper() if named else ", ".join(parameter.opts)
+        shown = str(parameter.name).upper() if named else ", ".join([*parameter.opts, *parameter.secondary_opts])
         rows.append((f"`{shown}`", _click_default(parameter), getattr(parameter, "help", "") or ""))
     if rows:
         parts.append(_table(("parameter", "default", "meaning"), rows))
@@ -194,6 +294,8 @@ def _click_default(parameter: Any) -> str:
     if isinstance(shown, str):
         return shown
     value = parameter.default
+    if value is True:
+        return f"`{parameter.opts[0]}`"
     return "" if value is None or value is False or callable(value) or value in ((), [], "") else f"`{value}`"
 
 
@@ -217,18 +319,29 @@ def _type_of(schema: dict[str, Any]) -> str:
         return ", ".join(f"`{each}`" for each in schema["enum"])
     if "$ref" in schema:
         return f"`{schema['$ref'].rpartition('/')[2]}`"
+    if "prefixItems" in schema:
+        return f"pair of {_type_of({'type': schema['prefixItems'][0]['type']})}s"
     if schema.get("type") == "array":
-        return f"list of {_type_of(schema.get('items', {}))}"
+        return "list of " + SEVERAL.sub(r"\1s", _type_of(schema.get("items", {})))
     bounds = [
-        f"{sign} {schema[key]:.10g}"
+        f"{sign} {_number(schema[key])}"
         for key, sign in (("minimum", "≥"), ("exclusiveMinimum", ">"), ("maximum", "≤"), ("exclusiveMaximum", "<"))
         if key in schema
     ]
     pattern = [f"pattern `{schema['pattern']}`"] if "pattern" in schema else []
-    return ", ".join([str(schema.get("type", "any")), *bounds, *pattern])
+    kind = "time (ISO 8601)" if schema.get("format") == "date-time" else str(schema.get("type", "any"))
+    return ", ".join([kind, *bounds, *pattern])
+
+
+def _number(value: float) -> str:
+    """Return a number with separators; a large power of two as such."""
+    power = round(math.log2(value)) if value > 2**53 else 0
+    return f"2^{power}" if power and value == 2**power else f"{value:,.10g}".replace("e-0", "e-")
 
 
 def _default(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
     if value is None or value == () or value == "":
         return "none"
     return f"{value:.0f}" if isinstance(value, float) and value.is_integer() else f"{value}"
@@ -242,8 +355,13 @@ def _plain(value: object) -> str:
 
 def _table(heads: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
     lines = [" | ".join(heads), " | ".join("---" for _ in heads)]
-    lines += [" | ".join(" ".join(cell.split()).replace("|", "\\|") for cell in row) for row in rows]
+    lines += [" | ".join(_cell(each) for each in row) for row in rows]
     return "\n".join(f"| {line} |" for line in lines)
+
+
+def _cell(text: str) -> str:
+    """Return a cell on one line, in which a bar outside code does not end it."""
+    return BAR.sub(lambda found: found[1] or r"\|", " ".join(text.split()))
 
 
 GENERATORS: dict[str, Callable[[], str]] = {
@@ -251,6 +369,9 @@ GENERATORS: dict[str, Callable[[], str]] = {
     "settings": settings,
     "cli": cli,
     "rest": rest,
+    "job": job,
+    "answers": answers,
+    "records": records,
     "errors": errors,
 }
 

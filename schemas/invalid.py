@@ -20,8 +20,10 @@ class Invalid(Exception):
         Stable machine-readable name of the fault, e.g. ``"too_few_frames"``.
     field : str
         The invalid input, e.g. ``"tracks"``, ``"mesh.faces"`` or ``"options.seed"``.
-    expected, got : str
-        What was expected and what was given, in words.
+    expected : str
+        What was expected, in words.
+    got : str
+        What was given, in words.
     hint : str
         What the user can do about it, as a complete sentence.
     """

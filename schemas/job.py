@@ -16,11 +16,22 @@ class Status(StrEnum):
     """Status of a job. The last three are final and never change."""
 
     QUEUED = "queued"
+    """It waits for a worker."""
+
     RUNNING = "running"
+    """A worker works on it."""
+
     CANCELLING = "cancelling"
+    """It was running when it was cancelled, and ends at its next step."""
+
     SUCCEEDED = "succeeded"
+    """It has a result."""
+
     FAILED = "failed"
+    """It has no result; `error` gives the reason."""
+
     CANCELLED = "cancelled"
+    """It was cancelled before it had a result."""
 
     @property
     def final(self) -> bool:
@@ -41,7 +52,7 @@ class Record(BaseModel):
 class Problem(Record):
     """An error as RFC 9457 problem details."""
 
-    title: str
+    title: str = Field(description="Short name of the error.")
     status: int = Field(description="The HTTP status code; for a failed job, the most similar one.")
     detail: str = Field(description="A complete sentence that ends with what to do.")
     code: str = Field(description="Stable machine-readable name, e.g. `wrong_shape` or `worker_lost`.")
@@ -50,8 +61,8 @@ class Problem(Record):
         description="Reference to the explanation of the code.",
     )
     field: str | None = Field(None, description="The invalid input, e.g. `tracks` or `options.loss`.")
-    expected: str | None = None
-    got: str | None = None
+    expected: str | None = Field(None, description="What the input should be.")
+    got: str | None = Field(None, description="What it is.")
     hint: str | None = Field(None, description="What to do.")
     retryable: bool = Field(False, description="True if the same request may succeed later.")
     choices: list[dict[str, Any]] | None = Field(
@@ -98,24 +109,26 @@ class Progress(Record):
     stage: str = Field(
         description="`track` (films), `loading`, `cameras`, `initialise`, `reweight`, `finish` or `exporting`."
     )
-    fraction: float = Field(ge=0, le=1)
-    reweighting: int = 0
-    max_reweightings: int = 0
-    objective: float | None = None
+    fraction: float = Field(ge=0, le=1, description="Completed share of the job, estimated.")
+    reweighting: int = Field(0, description="Number of finished reweightings of the robust loss.")
+    max_reweightings: int = Field(0, description="Maximum number of reweightings.")
+    objective: float | None = Field(
+        None, description="Objective of the solve, normalized units; null before the first shapes."
+    )
     residual: float | None = Field(None, description="Median visible reprojection residual, the tracks' unit.")
     seconds_left: float | None = Field(None, description="Estimate; null until one is possible.")
     followed: FollowedPoints | None = Field(None, description="Points that the stage `track` tracked last.")
-    updated_at: datetime
+    updated_at: datetime = Field(description="When this was reported.")
 
 
 class Artifact(Record):
     """A result file."""
 
-    name: str
-    media_type: str
-    bytes: int
-    sha256: str
-    description: str = ""
+    name: str = Field(description="File name, e.g. `shapes.npz`.")
+    media_type: str = Field(description="Media type, e.g. `model/gltf-binary`.")
+    bytes: int = Field(description="Size.")
+    sha256: str = Field(description="SHA-256 of the file, 64 hexadecimal digits.")
+    description: str = Field("", description="What it contains, in a sentence.")
 
 
 class Estimate(Record):
@@ -128,16 +141,16 @@ class Estimate(Record):
 class Interpretation(Record):
     """Interpretation of the inputs."""
 
-    num_frames: int
-    num_points: int
-    num_faces: int
+    num_frames: int = Field(description="F, frames that are used.")
+    num_points: int = Field(description="P, points that are used.")
+    num_faces: int = Field(description="Faces of the mesh.")
     hidden_fraction: float = Field(description="Share of the F·P observations with weight 0.")
     mesh_source: str = Field(description="`given`, `grid`, `delaunay`, `film` or `none`.")
     mesh_grid: tuple[int, int] | None = Field(
         None, description="Rows and columns, if the points form a complete grid, row by row."
     )
-    has_ground_truth: bool
-    has_rotations: bool
+    has_ground_truth: bool = Field(description="Whether true shapes were given, which error metrics need.")
+    has_rotations: bool = Field(description="Whether cameras were given.")
     layout: str = Field(
         description="How the track array was read, e.g. `tracks (F, P, 2)` or `W (2F, P), rows interleaved`."
     )
@@ -192,12 +205,12 @@ class Inspection(Interpretation):
 class Job(Record):
     """A reconstruction job."""
 
-    id: str
+    id: str = Field(description="3 to 64 letters, digits, underscores or dashes.")
     name: str = Field("", description="Label chosen by the user.")
-    status: Status
-    created_at: datetime
-    started_at: datetime | None = None
-    finished_at: datetime | None = None
+    status: Status = Field(description="Status of the job; `succeeded`, `failed` and `cancelled` are final.")
+    created_at: datetime = Field(description="When it was submitted.")
+    started_at: datetime | None = Field(None, description="When its attempt began; null while it waits.")
+    finished_at: datetime | None = Field(None, description="When the status became final; null until then.")
     expires_at: datetime | None = Field(None, description="When the job and its files are removed; null: never.")
     attempt: int = Field(0, description="Number of attempts so far.")
     retry_of: str | None = Field(None, description="The finished job that this one repeats.")
@@ -205,12 +218,13 @@ class Job(Record):
         None, description="The finished job whose result this one writes in further files, without solving again."
     )
     priority: Priority = Field(
-        "normal", description="Order among the waiting jobs of one owner; jobs of others are not passed."
+        "normal",
+        description="`high`, `normal` or `low`: order among the waiting jobs of one owner; jobs of others are not passed.",
     )
     place_in_queue: int | None = Field(None, description="Number of queued jobs ahead; null if not queued.")
-    options: Options
-    interpretation: Interpretation
-    progress: Progress | None = None
+    options: Options = Field(description="All options, also those that were not given.")
+    interpretation: Interpretation = Field(description="How the inputs were read.")
+    progress: Progress | None = Field(None, description="Latest progress of its attempt; null before there is any.")
     metrics: dict[str, float] | None = Field(
         None, description="Every error metric for which the inputs suffice, by its documented name."
     )
@@ -229,8 +243,8 @@ class Job(Record):
         None, description="A sentence with the expected error and the evidence for depth."
     )
     warnings: list[str] = Field(default_factory=list, description="Warnings about this result.")
-    artifacts: list[Artifact] = Field(default_factory=list)
-    error: Problem | None = None
+    artifacts: list[Artifact] = Field(default_factory=list, description="Result files; empty until the job succeeds.")
+    error: Problem | None = Field(None, description="Why the job failed; null unless it did.")
 
     @field_validator("options", mode="before")
     @classmethod
@@ -244,7 +258,7 @@ class Job(Record):
 class Upload(Record):
     """A large input that is uploaded separately and then referenced by jobs."""
 
-    id: str
+    id: str = Field(description="The id in the upload's address.")
     offset: int = Field(description="Bytes received.")
     length: int | None = Field(None, description="Bytes of the complete upload; null while unknown.")
     complete: bool = Field(description="True once all bytes are received; only then can a job use it.")
@@ -255,7 +269,7 @@ class Upload(Record):
 class JobPage(Record):
     """One page of jobs, newest first."""
 
-    jobs: list[Job]
+    jobs: list[Job] = Field(description="Jobs of this page.")
     next: str | None = Field(None, description="Pass as `cursor` to get the next page; null at the end.")
 
 
@@ -266,10 +280,10 @@ class ServiceLimits(Record):
     max_text_bytes: int = Field(description="Largest text field of a form.")
     max_upload_bytes: int = Field(0, description="Largest upload, over all its requests; 0: uploads are not available.")
     max_bytes: int = Field(description="Largest file, and all arrays read from it, inflated.")
-    max_frames: int
-    max_points: int
+    max_frames: int = Field(description="Most frames of one input.")
+    max_points: int = Field(description="Most points of one input.")
     max_observations: int = Field(description="Frames times points.")
-    max_faces: int
+    max_faces: int = Field(description="Most faces of a mesh.")
     max_wait_seconds: int = Field(description="Maximum n of `Prefer: wait=n`.")
     max_page: int = Field(description="Maximum number of jobs on one page.")
     max_queued: int = Field(

@@ -23,9 +23,9 @@ class ShareRequest(BaseModel):
 class Share(Record):
     """A share link of a job."""
 
-    id: str
-    created_at: datetime
-    expires_at: datetime
+    id: str = Field(description="Names the link when it is revoked.")
+    created_at: datetime = Field(description="When the link was created.")
+    expires_at: datetime = Field(description="When it stops working.")
     token: str | None = Field(
         None,
         description="Bearer token that reads the job and its files, and nothing else. Only the answer that creates the link has it.",

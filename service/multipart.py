@@ -40,8 +40,10 @@ class FormRules:
         Parts that are written to disk if they have a file name.
     texts : frozenset of str
         Parts that may be text; a part that is also in `files` is text if it has no file name.
-    max_body_bytes, max_text_bytes : int
-        Limits on the complete body and on one text.
+    max_body_bytes : int
+        Limit on the complete body.
+    max_text_bytes : int
+        Limit on one text.
     stall_seconds : float
         Seconds without a byte after which the request is refused.
     hint : callable

@@ -12,6 +12,7 @@ from pliant.schemas.outputs import OutputRequest
 from pliant.schemas.problems import ProblemCode, type_of
 from pliant.schemas.shares import ShareRequest
 from pliant.service.middleware.auth import is_public
+from pliant.service.middleware.origin import FOR_MACHINES
 from pliant.service.problems import MEDIA_TYPE
 
 SUMMARY = "Films, or dense 2-D point tracks, of a deforming object in, a moving 3-D mesh out."
@@ -196,9 +197,7 @@ _ERROR_HEADERS = {
     429: ("Retry-After", "Seconds to wait."),
     503: ("Retry-After", "Seconds to wait."),
 }
-_EVERYWHERE = (421, 500)
-"""Errors of any path: unknown Host, internal error."""
-_WITH_TOKEN = (401, 403, 429, 503)
+_WITH_TOKEN = {401, 403, 429, 503}
 """Further errors of paths that need a token: missing or invalid token, missing scope, rate limit, unavailable token store."""
 
 
@@ -242,9 +241,13 @@ def _complete(operation: dict[str, Any], path: str) -> None:
     responses = operation["responses"]
     if "422" in responses:
         responses["422"] = _problem(422)
-    usual: tuple[int, ...] = _EVERYWHERE if open_to_all else _EVERYWHERE + _WITH_TOKEN
+    usual = {500}
+    if path not in FOR_MACHINES:  # these accept every Host
+        usual.add(421)
+    if not open_to_all:
+        usual |= _WITH_TOKEN
     if "{" in path:
-        usual += (404,)
+        usual.add(404)
     for status in usual:
         responses.setdefault(str(status), _problem(status))
     operation["responses"] = dict(sorted(responses.items()))

@@ -287,6 +287,7 @@ def _read_film(form: Form, options: Options, bounds: FilmBounds, target: Path | 
     source = FilmSource(
         form.files["film"].path, None if region is None else region.path, film_name=form.files["film"].name or "the film",
         region_name="the region" if region is None else region.name or "the region",
+        own_rate="fps" in options.model_fields_set,
     )  # fmt: skip
     facts = check_film(source, options, bounds, picture=picture)
     options = film_options(options, facts)

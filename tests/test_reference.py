@@ -6,12 +6,15 @@ import ast
 import importlib.util
 import re
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from pliant import client
 from pliant.cli import app
 from pliant.cli.exits import Exit
+from pliant.schemas.job import Job
 from pliant.schemas.options import Options
 from pliant.schemas.problems import ProblemCode
 from pliant.service import metrics
@@ -113,6 +116,7 @@ def test_every_command_is_generated_with_its_parameters(generate: ModuleType) ->
     assert names <= set(re.findall(r"^### pliant (\w+)$", text, re.MULTILINE))
     assert "### pliant token create" in text
     assert "| `--ground-truth, -g` |" in text
+    assert "| `--browser, --no-browser` | `--browser` |" in text
 
 
 def test_no_help_has_words_in_brackets() -> None:
@@ -130,9 +134,17 @@ def test_no_help_has_words_in_brackets() -> None:
 
 def test_every_option_is_generated_with_its_default(generate: ModuleType) -> None:
     text = generate.options()
-    assert re.findall(r"^### (\w+)$", text, re.MULTILINE) == list(Options.model_fields)
-    assert "Type: number, > 0, ≤ 1000. Default: `25.0`." in text
+    assert sorted(re.findall(r"^### (\w+)$", text, re.MULTILINE)) == sorted(Options.model_fields)
+    assert "Type: number, > 0, ≤ 1,000. Default: `25.0`." in text
+    assert "Type: number, ≥ 1e-9, ≤ 1,000 or null." in text
     assert "Type: boolean. Default: `true`." in text
+    assert "Type: list of pairs of numbers or null." in text
+
+
+def test_groups_of_options_leave_the_anchors_to_the_options(generate: ModuleType) -> None:
+    groups = re.findall(r"^## (.+) \{ #(.+) \}$", generate.options(), re.MULTILINE)
+    assert [name for name, _ in groups] == list(generate.OPTION_GROUPS)
+    assert {anchor for _, anchor in groups}.isdisjoint(Options.model_fields)
 
 
 def test_every_setting_is_documented(generate: ModuleType) -> None:
@@ -142,6 +154,7 @@ def test_every_setting_is_documented(generate: ModuleType) -> None:
     assert len(known) == len(set(known))
     assert f"| `PLIANT_PORT` | {ServiceSettings().port} |" in generate.settings()
     assert "| `PLIANT_RETENTION` | 2592000 |" in generate.settings()
+    assert "| `PLIANT_PRESIGNED_REDIRECTS` | true |" in generate.settings()
 
 
 def test_every_operation_is_generated_with_its_scope(generate: ModuleType) -> None:
@@ -151,6 +164,40 @@ def test_every_operation_is_generated_with_its_scope(generate: ModuleType) -> No
     assert text.count(" Scope: ") == len(real)
     assert "### GET /healthz\n\nLiveness: the process answers. Scope: none." in text
     assert re.search(r"### GET /metrics\n\n.*Scope: `admin`\.", text)
+
+
+def test_every_record_of_an_answer_is_documented(generate: ModuleType) -> None:
+    text = generate.job() + "\n\n" + generate.answers()
+    linked = set(re.findall(r"\]\(#(\w+)\)", text + generate.rest()))
+    assert linked == {name.lower() for name in (*generate.JOB_RECORDS, *generate.ANSWER_RECORDS)}
+    assert [row for row in text.splitlines() if row.endswith("|  |")] == [], "a member without a meaning"
+    assert "One of `queued`, `running`, `cancelling`, `succeeded`, `failed`, `cancelled`." in text
+    for name in Job.model_fields:
+        assert f"| `{name}` |" in text
+
+
+def test_every_public_name_of_the_sdk_has_an_entry(generate: ModuleType) -> None:
+    text = (REFERENCE / "sdk.md").read_text(encoding="utf-8") + generate.records()
+    entries = re.findall(r"^::: (\S+)$", text, re.MULTILINE)
+    assert {f"pliant.client.{name}" for name in client.__all__} <= set(entries)
+    assert len(entries) == len(set(entries))
+    assert "| `finished_at` | `datetime | None` | When the status became final; None until then. |" in text
+
+
+@pytest.mark.parametrize("folder", ["schemas", "solver", "tracking", "worker", "service", "client", "cli"])
+def test_docstrings_have_an_entry_for_each_parameter(folder: str) -> None:
+    """The reference gives all names of one entry the type of the first."""
+    grouped = []
+    for path in (ROOT / folder).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                for part in re.split(r"\n\n(?=\w[\w ]*\n-{3,}\n)", ast.get_docstring(node) or "")[1:]:
+                    title, _, *lines = part.splitlines()
+                    names = [
+                        line for line in lines if title != "Raises" and re.match(r"\**\w+, ?\**\w+[\w, ]*( :|$)", line)
+                    ]
+                    grouped += [f"{path.relative_to(ROOT)}: {name}" for name in names]
+    assert grouped == []
 
 
 def test_every_part_of_a_submission_is_documented() -> None:
@@ -177,6 +224,13 @@ def test_markers_are_replaced_and_pages_copied(generate: ModuleType, tmp_path: P
     assert len(fences) > 100
     assert [line for line in fences if not re.fullmatch(r" *```\w*", line)] == []
     assert not (tmp_path / "site" / "generate.py").exists()
+    assert [page.name for page in pages if skips_a_level(page.read_text(encoding="utf-8"))] == []
+
+
+def skips_a_level(text: str) -> bool:
+    outside = re.sub(r"^ *```.*?^ *```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    levels = [len(marks) for marks in re.findall(r"^(#+) ", outside, re.MULTILINE)]
+    return any(after > before + 1 for before, after in pairwise(levels))
 
 
 def test_every_page_is_in_the_navigation() -> None:

@@ -42,7 +42,7 @@ def configure(kind: str, *, service: str) -> None:
         provider = TracerProvider(resource=Resource.create({SERVICE_NAME: service}))
         provider.add_span_processor(BatchSpanProcessor(_exporter(kind)))
     except ImportError as error:
-        expected = "off, or the extra otel: pip install 'pliant[otel]'"
+        expected = "off, or the extra otel (pip install '.[otel]' in Pliant's source folder)"
         raise InvalidSetting("PLIANT_TRACING", expected=expected, got=kind) from error
     use(provider)
 

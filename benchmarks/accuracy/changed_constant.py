@@ -8,6 +8,7 @@ earlier. The kernel kills the process after SECONDS of processor time.
 
 from __future__ import annotations
 
+import argparse
 import ast
 import hashlib
 import json
@@ -130,17 +131,20 @@ def made(name: str) -> tuple[Case, dict[str, Any]]:
     return replace(case, tracks=tracks, cameras=case.cameras if how == "given cameras" else None), {}
 
 
-def main(arguments: list[str]) -> None:
+def main() -> None:
     """Solve, and print error, processor seconds and a digest of the shapes as one JSON line."""
-    name, *change = arguments
-    if change:
-        module, constant, factor, seconds = change
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("case", metavar="CASE")
+    parser.add_argument("change", nargs="*", help="MODULE NAME FACTOR SECONDS")
+    given = parser.parse_args()
+    if given.change:
+        module, constant, factor, seconds = given.change
         sys.meta_path.insert(0, ChangedConstant(module, constant, float(factor)))
         resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds)))
     from pliant.solver import Settings, solve
     from pliant.solver.evaluation.metrics import e3d_frame_scaled
 
-    case, settings = made(name)
+    case, settings = made(given.case)
     assert case.shapes is not None
     warnings.simplefilter("ignore")
     began = time.process_time()
@@ -154,4 +158,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

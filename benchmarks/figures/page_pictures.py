@@ -4,7 +4,7 @@
     python -m benchmarks.figures.page_pictures FOLDER --only running,share --whole
 
 Writes FOLDER/STATE-WIDTH-SCHEME.png, 36 pictures of the visible part of the window, or with `--whole` of the whole page. Needs a Chromium,
-the built page (`python build_page.py`) and, for the film, `pliant[film]`.
+the built page (`python build_page.py`) and, for the film, the extra `film`.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ API and worker are separate processes, which print their spans and log lines. Th
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import re
@@ -15,7 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -24,7 +25,7 @@ from xml.sax.saxutils import escape
 import httpx
 from pliant.client import Client
 from pliant.solver.gallery import face
-from pliant.worker.processes.valkey import Valkey
+from pliant.worker.processes.valkey import attended
 from pliant.worker.settings import Settings
 
 IMAGE = Path(__file__).parents[2] / "docs" / "images" / "trace.svg"
@@ -63,14 +64,13 @@ def installation(folder: Path) -> Iterator[str]:
         **os.environ, **settings.to_environment(), "PLIANT_PORT": str(port), "PLIANT_LOG_FORMAT": "json",
         "PLIANT_LOG_LEVEL": "info",
     }  # fmt: skip
-    valkey = Valkey.claim(settings.data)
-    server = valkey.start()
-    running = []
-    for name, module in (("api", ["pliant.service"]), ("worker", ["pliant.worker", "work"])):
-        with (folder / f"{name}.spans").open("wb") as out, (folder / f"{name}.log").open("wb") as log:
-            running.append(subprocess.Popen([sys.executable, "-m", *module], env=env, stdout=out, stderr=log))
     url = f"http://127.0.0.1:{port}"
-    try:
+    with attended(settings), ExitStack() as started:
+        for name, module in (("api", ["pliant.service"]), ("worker", ["pliant.worker", "work"])):
+            with (folder / f"{name}.spans").open("wb") as out, (folder / f"{name}.log").open("wb") as log:
+                process = subprocess.Popen([sys.executable, "-m", *module], env=env, stdout=out, stderr=log)
+            started.enter_context(process)  # waits for its end
+            started.callback(process.terminate)
         until = time.monotonic() + 60
         while time.monotonic() < until:
             try:
@@ -80,13 +80,6 @@ def installation(folder: Path) -> Iterator[str]:
                 pass
             time.sleep(0.2)
         yield url
-    finally:
-        for process in running:
-            process.send_signal(signal.SIGTERM)
-            process.wait(30)
-        server.terminate()
-        server.wait(30)
-        valkey.release()
 
 
 def read_spans(text: str) -> list[tuple[str, Span]]:
@@ -136,6 +129,8 @@ def lines_of(job: str, text: str) -> list[str]:
 
 def main() -> None:
     """Run one job, draw it, print its log."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # the started processes end, too
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         with installation(folder) as url, Client(url) as client:

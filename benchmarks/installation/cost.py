@@ -1,13 +1,11 @@
-"""Compare memory and processor time of whole jobs with their estimates: `python -m benchmarks.installation.cost [--near]`.
-
-With `--near`, the time of the solver alone where perspective is found, relative to the same face far away: with noise, and with 20 % hidden
-observations on top.
-"""
+"""Compare memory and processor time of whole jobs with their estimates: `python -m benchmarks.installation.cost [--near]`."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -75,10 +73,30 @@ def _seconds(case: Case, distance: float, spoiling: Spoiling, picture: tuple[flo
 
 
 def main() -> None:
+    """Measure what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--near", action="store_true", help="time of the solver where perspective is found, relative to the same face far away: "
+        "with noise, and with 20 %% hidden observations on top",
+    )  # fmt: skip
+    parser.add_argument(
+        "--measure", type=int, nargs=2, metavar=("FRAMES", "POINTS"), help="one job, in this process; prints JSON"
+    )
+    given = parser.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # the process that measures ends, too
+    if given.near:
+        near()
+    elif given.measure:
+        measure(*given.measure)
+    else:
+        compare()
+
+
+def compare() -> None:
     """Measure every size in a separate process."""
     print(f"{'frames × points':>17} {'peak, MB':>9} {'estimate':>9} {'seconds':>9} {'estimate':>9}")
     for frames, points in SIZES:
-        command = [sys.executable, "-m", "benchmarks.installation.cost", str(frames), str(points)]
+        command = [sys.executable, "-m", "benchmarks.installation.cost", "--measure", str(frames), str(points)]
         found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
         guess = estimated(frames, found["points"], Options())
         print(
@@ -89,9 +107,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["--near"]:
-        near()
-    elif len(sys.argv) > 1:
-        measure(int(sys.argv[1]), int(sys.argv[2]))
-    else:
-        main()
+    main()

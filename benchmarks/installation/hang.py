@@ -6,6 +6,7 @@ a port without a listener (refused). Valkey is stopped with SIGSTOP (dropped).
 
 from __future__ import annotations
 
+import argparse
 import os
 import signal
 import socket
@@ -118,13 +119,15 @@ def timed(url: str, id: str) -> tuple[dict[str, str], str]:
 
 def main() -> None:
     """Print the table."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # the started processes end, too
     columns: dict[str, tuple[dict[str, str], str]] = {}
     with tempfile.TemporaryDirectory() as folder:
         data = Path(folder) / "data"
         valkey = Valkey.claim(data)
         server = valkey.start()
-        id = _failed(Settings(data=data))
         try:
+            id = _failed(Settings(data=data))
             with dropping() as port, service(data, port) as url:
                 columns["S3 dropped"] = timed(url, id)
             with service(data, free_port()) as url:

@@ -146,7 +146,7 @@ class Batch:
                 bar.label = str(row.file)
                 self._follow(row, job, bar)
                 row.job = client.get(job.id).record
-                err().print(f"{row.file}: {row.job.status}", highlight=False, markup=False)
+                err().print(f"{row.file}: {row.job.status}")
 
     def _submit(self, client: Client, bar: Bar) -> list[tuple[Row, RemoteJob]]:
         """Submit each file and print its job id immediately, so that an interruption loses none.
@@ -180,7 +180,7 @@ class Batch:
             row.job = job.record
             self.session.following, self.session.others = job.id, len(submitted)
             submitted.append((row, job))
-            err().print(f"{file}: job {job.id}", highlight=False, markup=False)
+            err().print(f"{file}: job {job.id}")
         return submitted
 
     def _follow(self, row: Row, job: RemoteJob, bar: Bar) -> None:

@@ -28,11 +28,11 @@ def explain(
     screen = out()
     for each in codes:
         if not code:
-            screen.print(f"{each.value}  {each.heading}", markup=False)
+            screen.print(f"{each.value}  {each.heading}")
             continue
         status = "" if each.status is None else f" (HTTP status {each.status})"
-        screen.print(f"{each.heading}: {each.value}{status}", markup=False)
-        screen.print(f"{each.cause}\nWhat to do: {each.remedy}", markup=False)
+        screen.print(f"{each.heading}: {each.value}{status}")
+        screen.print(f"{each.cause}\nWhat to do: {each.remedy}")
 
 
 def found_code(text: str) -> ProblemCode:

@@ -45,7 +45,7 @@ def view(
         if as_json:
             print_json({"url": url})
         else:
-            out().print(url, markup=False, soft_wrap=True)
+            out().print(url)
             err().print("Ctrl-C ends it.")
         if browser:
             webbrowser.open(url)
@@ -88,7 +88,7 @@ def share(
     if as_json:
         print_json({**made.model_dump(mode="json"), "url": address})
     else:
-        out().print(address, markup=False, soft_wrap=True)
+        out().print(address)
         err().print(f"Link {made.id}, valid until {made.expires_at:%Y-%m-%d %H:%M} UTC.", highlight=False)
 
 

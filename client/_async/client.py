@@ -212,8 +212,22 @@ class AsyncClient(AsyncConnection):
 
         Parameters
         ----------
-        tracks, visible, mesh, ground_truth, rotations, options, on_upload, timeout
-            As for `submit`.
+        tracks : array_like, mapping or path
+            Points (F, P, 2), the dictionary of a tracker, or the path of a file, as for `submit`.
+        visible : array_like, optional
+            Shape (F, P), bool or confidence in [0, 1]; only with an array of tracks.
+        mesh : array_like, (rows, columns), path, optional
+            Faces (T, 3) or (T, 4), the size of a grid, a mesh file, or ``"none"``.
+        ground_truth : array_like or path, optional
+            True shapes (F, P, 3).
+        rotations : array_like or path, optional
+            Known cameras (F, 2, 3) or (F, 3, 3).
+        options : Options or mapping, optional
+            Options that determine how the inputs are read.
+        on_upload : callable, optional
+            Called with (bytes sent, total bytes).
+        timeout : float, optional
+            Seconds for the whole call, retries included.
 
         Returns
         -------
@@ -367,6 +381,8 @@ class AsyncClient(AsyncConnection):
             Frames per second of the written animation; by default the job's.
         idempotency_key : str, optional
             By default the same request returns the same job, unless that one failed or was cancelled.
+        timeout : float, optional
+            Seconds for the whole call, retries included.
         **options
             ``normals``, ``colours``, ``axes``, ``glb_quantized`` and ``glb_motion``; by default the job's.
 
@@ -390,8 +406,12 @@ class AsyncClient(AsyncConnection):
 
         Parameters
         ----------
+        job : str
+            The id of a job that has succeeded.
         days : float
             Lifetime of the link, from one minute to 366 days.
+        timeout : float, optional
+            Seconds for the whole call, retries included.
         """
         body = sharing(days).model_dump_json(exclude_unset=True).encode()
         call = Call(method="POST", path=f"{job_path(job)}/shares", headers=JSON_BODY, content=body)
@@ -423,10 +443,21 @@ class AsyncClient(AsyncConnection):
 
         Parameters
         ----------
+        job : str
+            The id of a job that has succeeded.
+        folder : path
+            Where the files are written; it is created if it does not exist.
         names : iterable of str, optional
             Names of the files; by default all.
         on_download : callable, optional
             Called with (bytes of this file so far, total bytes of this file).
+        timeout : float, optional
+            Seconds for the whole call, retries included.
+
+        Returns
+        -------
+        dict of str to Path
+            The path of each file, by its name.
         """
         exchange = self._exchange(timeout, f"the download of job {job}")
         record = await exchange.record(Call(method="GET", path=job_path(job)), Job)

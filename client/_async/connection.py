@@ -19,6 +19,9 @@ DEFAULT_URL = "http://127.0.0.1:8000"
 class AsyncConnection:
     """Base class of `AsyncClient`, which documents the parameters. Close it, or use it in a ``with`` block."""
 
+    url: str
+    """Address of the service, without a slash at the end."""
+
     def __init__(
         self,
         url: str | None = None,

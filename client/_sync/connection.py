@@ -20,6 +20,9 @@ DEFAULT_URL = "http://127.0.0.1:8000"
 class Connection:
     """Base class of `Client`, which documents the parameters. Close it, or use it in a ``with`` block."""
 
+    url: str
+    """Address of the service, without a slash at the end."""
+
     def __init__(
         self,
         url: str | None = None,

@@ -14,7 +14,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 _LOOPBACK_HOSTS = frozenset({"localhost", "127.0.0.1", "[::1]"})
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
-_FOR_MACHINES = frozenset({"/healthz", "/readyz", "/metrics"})
+FOR_MACHINES = frozenset({"/healthz", "/readyz", "/metrics"})
 """Paths for probes and monitoring, which address a process by an IP address that nobody can list beforehand."""
 
 
@@ -40,7 +40,7 @@ class OriginCheck:
     def _refusal(self, scope: Scope) -> Response | None:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
-        listed = scope["path"] in _FOR_MACHINES or not self._hosts or _without_port(host) in self._hosts
+        listed = scope["path"] in FOR_MACHINES or not self._hosts or _without_port(host) in self._hosts
         if not listed:
             detail = f"This service does not answer for the host {host[:80]!r}. The operator can add it to PLIANT_ALLOWED_HOSTS."
             return answer(ProblemCode.UNKNOWN_HOST, detail=detail, field="Host", got=host[:80])

@@ -18,9 +18,9 @@ router = APIRouter(prefix="/errors", tags=["about"])
 class ErrorCode(Record):
     """Explanation of an error code."""
 
-    code: ProblemCode
+    code: ProblemCode = Field(description="Stable machine-readable name of the error.")
     status: int | None = Field(description="Usual HTTP status; null if no HTTP answer carries the code.")
-    title: str
+    title: str = Field(description="Short name of the error.")
     cause: str = Field(description="When the error occurs.")
     remedy: str = Field(description="What to do.")
     retryable: bool = Field(description="True if the same request can succeed later.")

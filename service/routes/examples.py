@@ -10,6 +10,7 @@ from pliant.schemas.job import Record
 from pliant.service.openapi import problems
 from pliant.worker.examples import EXAMPLES, example_file
 from pliant.worker.films import example as example_film
+from pydantic import Field
 
 router = APIRouter(prefix="/v1/examples", tags=["about"])
 
@@ -20,26 +21,27 @@ File = Annotated[str, Path(description="One of its files.", examples=["tracks.np
 class ExampleFile(Record):
     """One input file of an example."""
 
-    part: str
-    """Name of the form part for this file."""
-    file: str
-    url: str
+    part: str = Field(description="Name of the form part for this file.")
+    file: str = Field(description="Its name.")
+    url: str = Field(description="Its address, relative to the service.")
 
 
 class Example(Record):
     """A synthetic sequence with ground truth."""
 
-    name: str
-    title: str
-    files: list[ExampleFile]
-    region_polygon: list[tuple[float, float]] | None = None
-    """Outline of the object in a film's first frame, for the option of the same name."""
+    name: str = Field(description="Its name in addresses.")
+    title: str = Field(description="What it shows, in a few words.")
+    files: list[ExampleFile] = Field(description="Input files, one for each form part.")
+    region_polygon: list[tuple[float, float]] | None = Field(
+        None,
+        description="Outline of the object in a film's first frame, for the option of the same name; null for tracks.",
+    )
 
 
 class Examples(Record):
     """All examples."""
 
-    examples: list[Example]
+    examples: list[Example] = Field(description="Every example that this installation can run.")
 
 
 @router.get("", operation_id="list_examples", summary="List example inputs", responses=problems(401))

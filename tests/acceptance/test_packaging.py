@@ -160,6 +160,6 @@ def test_extras_install_into_a_clean_environment(archives: tuple[Path, Path], tm
         if extra == "":
             missing = subprocess.run([python, "-m", "pliant.cli", "up"], capture_output=True, text=True, check=False)
             assert missing.returncode == 8
-            assert "pip install 'pliant[server]'" in missing.stderr
+            assert "pip install '.[server]'" in missing.stderr
             assert "Traceback" not in missing.stderr
     assert sizes[""] < sizes["[server]"]

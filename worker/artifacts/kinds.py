@@ -59,8 +59,8 @@ def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0), textured: boo
         if output in options.outputs and not there():
             raise InvalidInput(
                 "output_unavailable", field="options.outputs", expected="outputs that this installation can write",
-                got=f"{output}, which needs the package {package}", hint="Install it beside the worker and the service "
-                f"(pip install 'pliant[{extra}]'), or leave {output} out.",
+                got=f"{output}, which needs the package {package}", hint=f"Install the extra {extra} beside the worker and the "
+                f"service (pip install '.[{extra}]' in Pliant's source folder), or leave {output} out.",
             )  # fmt: skip
     if "mat" in options.outputs and not matlab.fits(*size):
         raise InvalidInput(

@@ -72,6 +72,8 @@ def reconstruct_film(
         except Interrupted:
             halt.check()
             raise
+        if not source.own_rate:
+            options = options.model_copy(update={"fps": tracked.fps})
         inputs = read_tracked(scratch / "tracks.npz", tracked, options)
         spent = {"track": time.perf_counter() - began}
         directory.mkdir(parents=True, exist_ok=True)
@@ -85,6 +87,7 @@ def reconstruct_film(
         artifacts=(*artifacts, *finished.artifacts),
         warnings=(*tracked.warnings, *finished.warnings),
         interpretation=inputs.interpretation,
+        options=options,
     )
 
 

@@ -133,4 +133,6 @@ def _inputs(file: Path, job: Job) -> Inputs:
             canonical = "interpretation.npy" in archive.namelist()
     except zipfile.BadZipFile as error:
         raise damaged("inputs", "inputs that cannot be read back") from error
-    return load_inputs(file) if canonical else read_tracked(file, Tracked(container="stored", warnings=()), job.options)
+    if canonical:
+        return load_inputs(file)
+    return read_tracked(file, Tracked(container="stored", fps=job.options.fps, warnings=()), job.options)

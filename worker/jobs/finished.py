@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pliant.schemas.job import Artifact, Interpretation
+from pliant.schemas.options import Options
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,6 +29,9 @@ class Finished:
 
     interpretation: Interpretation | None = None
     """Interpretation of the inputs if it was not known at submission, as for the tracks of a film."""
+
+    options: Options | None = None
+    """The options if the job determined one, as the frame rate of a film."""
 
     verdict: str | None = None
     """`good`, `with_care` or `do_not_use`; None if the solver gave no verdict."""

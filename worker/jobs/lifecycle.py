@@ -70,7 +70,7 @@ def report(stored: Stored, *, attempt_id: str, progress: Progress) -> Stored:
 def succeed(
     stored: Stored, finished: Finished, *, attempt_id: str, prefix: str, now: datetime, retention: float
 ) -> Stored:
-    """Publish the result, and the interpretation if the job determined it.
+    """Publish the result, and interpretation and options if the job determined them.
 
     A job whose cancellation was requested in the meantime ends cancelled.
 
@@ -92,6 +92,7 @@ def succeed(
         "warnings": list(finished.warnings),
         "artifacts": list(finished.artifacts),
         **({} if finished.interpretation is None else {"interpretation": finished.interpretation}),
+        **({} if finished.options is None else {"options": finished.options}),
     }
     job = stored.job.model_copy(update=update)
     size = stored.bytes + sum(each.bytes for each in finished.artifacts)

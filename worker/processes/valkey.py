@@ -123,7 +123,11 @@ class Valkey:
     def start(self) -> subprocess.Popen[bytes]:
         """Start the server in a session of its own, so that Ctrl-C reaches the supervisor first, and wait for it."""
         process = subprocess.Popen(self.argv, pass_fds=(self.server_lock,), start_new_session=True)  # noqa: S603
-        self.wait(process)
+        try:
+            self.wait(process)
+        except BaseException:  # an interruption, too
+            process.kill()
+            raise
         return process
 
     def log_tail(self) -> str:

@@ -12,16 +12,29 @@ export interface components {
          * @description A result file.
          */
         Artifact: {
-            /** Name */
+            /**
+             * Name
+             * @description File name, e.g. `shapes.npz`.
+             */
             name: string;
-            /** Media Type */
+            /**
+             * Media Type
+             * @description Media type, e.g. `model/gltf-binary`.
+             */
             media_type: string;
-            /** Bytes */
+            /**
+             * Bytes
+             * @description Size.
+             */
             bytes: number;
-            /** Sha256 */
+            /**
+             * Sha256
+             * @description SHA-256 of the file, 64 hexadecimal digits.
+             */
             sha256: string;
             /**
              * Description
+             * @description What it contains, in a sentence.
              * @default
              */
             description: string;
@@ -31,13 +44,17 @@ export interface components {
          * @description Explanation of an error code.
          */
         ErrorCode: {
+            /** @description Stable machine-readable name of the error. */
             code: components["schemas"]["ProblemCode"];
             /**
              * Status
              * @description Usual HTTP status; null if no HTTP answer carries the code.
              */
             status: number | null;
-            /** Title */
+            /**
+             * Title
+             * @description Short name of the error.
+             */
             title: string;
             /**
              * Cause
@@ -76,13 +93,25 @@ export interface components {
          * @description A synthetic sequence with ground truth.
          */
         Example: {
-            /** Name */
+            /**
+             * Name
+             * @description Its name in addresses.
+             */
             name: string;
-            /** Title */
+            /**
+             * Title
+             * @description What it shows, in a few words.
+             */
             title: string;
-            /** Files */
+            /**
+             * Files
+             * @description Input files, one for each form part.
+             */
             files: components["schemas"]["ExampleFile"][];
-            /** Region Polygon */
+            /**
+             * Region Polygon
+             * @description Outline of the object in a film's first frame, for the option of the same name; null for tracks.
+             */
             region_polygon: [
                 number,
                 number
@@ -93,11 +122,20 @@ export interface components {
          * @description One input file of an example.
          */
         ExampleFile: {
-            /** Part */
+            /**
+             * Part
+             * @description Name of the form part for this file.
+             */
             part: string;
-            /** File */
+            /**
+             * File
+             * @description Its name.
+             */
             file: string;
-            /** Url */
+            /**
+             * Url
+             * @description Its address, relative to the service.
+             */
             url: string;
         };
         /**
@@ -105,7 +143,10 @@ export interface components {
          * @description All examples.
          */
         Examples: {
-            /** Examples */
+            /**
+             * Examples
+             * @description Every example that this installation can run.
+             */
             examples: components["schemas"]["Example"][];
         };
         /**
@@ -144,11 +185,20 @@ export interface components {
          * @description Interpretation of inputs, with a sample of tracks or the first frame of a film.
          */
         Inspection: {
-            /** Num Frames */
+            /**
+             * Num Frames
+             * @description F, frames that are used.
+             */
             num_frames: number;
-            /** Num Points */
+            /**
+             * Num Points
+             * @description P, points that are used.
+             */
             num_points: number;
-            /** Num Faces */
+            /**
+             * Num Faces
+             * @description Faces of the mesh.
+             */
             num_faces: number;
             /**
              * Hidden Fraction
@@ -168,9 +218,15 @@ export interface components {
                 number,
                 number
             ] | null;
-            /** Has Ground Truth */
+            /**
+             * Has Ground Truth
+             * @description Whether true shapes were given, which error metrics need.
+             */
             has_ground_truth: boolean;
-            /** Has Rotations */
+            /**
+             * Has Rotations
+             * @description Whether cameras were given.
+             */
             has_rotations: boolean;
             /**
              * Layout
@@ -249,11 +305,20 @@ export interface components {
          * @description Interpretation of the inputs.
          */
         Interpretation: {
-            /** Num Frames */
+            /**
+             * Num Frames
+             * @description F, frames that are used.
+             */
             num_frames: number;
-            /** Num Points */
+            /**
+             * Num Points
+             * @description P, points that are used.
+             */
             num_points: number;
-            /** Num Faces */
+            /**
+             * Num Faces
+             * @description Faces of the mesh.
+             */
             num_faces: number;
             /**
              * Hidden Fraction
@@ -273,9 +338,15 @@ export interface components {
                 number,
                 number
             ] | null;
-            /** Has Ground Truth */
+            /**
+             * Has Ground Truth
+             * @description Whether true shapes were given, which error metrics need.
+             */
             has_ground_truth: boolean;
-            /** Has Rotations */
+            /**
+             * Has Rotations
+             * @description Whether cameras were given.
+             */
             has_rotations: boolean;
             /**
              * Layout
@@ -344,7 +415,10 @@ export interface components {
          * @description A reconstruction job.
          */
         Job: {
-            /** Id */
+            /**
+             * Id
+             * @description 3 to 64 letters, digits, underscores or dashes.
+             */
             id: string;
             /**
              * Name
@@ -352,15 +426,23 @@ export interface components {
              * @default
              */
             name: string;
+            /** @description Status of the job; `succeeded`, `failed` and `cancelled` are final. */
             status: components["schemas"]["Status"];
             /**
              * Created At
              * Format: date-time
+             * @description When it was submitted.
              */
             created_at: string;
-            /** Started At */
+            /**
+             * Started At
+             * @description When its attempt began; null while it waits.
+             */
             started_at: string | null;
-            /** Finished At */
+            /**
+             * Finished At
+             * @description When the status became final; null until then.
+             */
             finished_at: string | null;
             /**
              * Expires At
@@ -385,7 +467,7 @@ export interface components {
             outputs_of: string | null;
             /**
              * Priority
-             * @description Order among the waiting jobs of one owner; jobs of others are not passed.
+             * @description `high`, `normal` or `low`: order among the waiting jobs of one owner; jobs of others are not passed.
              * @default normal
              * @enum {string}
              */
@@ -395,8 +477,11 @@ export interface components {
              * @description Number of queued jobs ahead; null if not queued.
              */
             place_in_queue: number | null;
+            /** @description All options, also those that were not given. */
             options: components["schemas"]["Options"];
+            /** @description How the inputs were read. */
             interpretation: components["schemas"]["Interpretation"];
+            /** @description Latest progress of its attempt; null before there is any. */
             progress: components["schemas"]["Progress"] | null;
             /**
              * Metrics
@@ -435,8 +520,12 @@ export interface components {
              * @description Warnings about this result.
              */
             warnings: string[];
-            /** Artifacts */
+            /**
+             * Artifacts
+             * @description Result files; empty until the job succeeds.
+             */
             artifacts: components["schemas"]["Artifact"][];
+            /** @description Why the job failed; null unless it did. */
             error: components["schemas"]["Problem"] | null;
         };
         /**
@@ -444,7 +533,10 @@ export interface components {
          * @description One page of jobs, newest first.
          */
         JobPage: {
-            /** Jobs */
+            /**
+             * Jobs
+             * @description Jobs of this page.
+             */
             jobs: components["schemas"]["Job"][];
             /**
              * Next
@@ -765,7 +857,10 @@ export interface components {
          * @description An error as RFC 9457 problem details.
          */
         Problem: {
-            /** Title */
+            /**
+             * Title
+             * @description Short name of the error.
+             */
             title: string;
             /**
              * Status
@@ -792,11 +887,13 @@ export interface components {
             field: string | null;
             /**
              * Expected
+             * @description What the input should be.
              * @default null
              */
             expected: string | null;
             /**
              * Got
+             * @description What it is.
              * @default null
              */
             got: string | null;
@@ -836,19 +933,27 @@ export interface components {
              * @description `track` (films), `loading`, `cameras`, `initialise`, `reweight`, `finish` or `exporting`.
              */
             stage: string;
-            /** Fraction */
+            /**
+             * Fraction
+             * @description Completed share of the job, estimated.
+             */
             fraction: number;
             /**
              * Reweighting
+             * @description Number of finished reweightings of the robust loss.
              * @default 0
              */
             reweighting: number;
             /**
              * Max Reweightings
+             * @description Maximum number of reweightings.
              * @default 0
              */
             max_reweightings: number;
-            /** Objective */
+            /**
+             * Objective
+             * @description Objective of the solve, normalized units; null before the first shapes.
+             */
             objective: number | null;
             /**
              * Residual
@@ -865,6 +970,7 @@ export interface components {
             /**
              * Updated At
              * Format: date-time
+             * @description When this was reported.
              */
             updated_at: string;
         };
@@ -894,16 +1000,25 @@ export interface components {
              * @description Largest file, and all arrays read from it, inflated.
              */
             max_bytes: number;
-            /** Max Frames */
+            /**
+             * Max Frames
+             * @description Most frames of one input.
+             */
             max_frames: number;
-            /** Max Points */
+            /**
+             * Max Points
+             * @description Most points of one input.
+             */
             max_points: number;
             /**
              * Max Observations
              * @description Frames times points.
              */
             max_observations: number;
-            /** Max Faces */
+            /**
+             * Max Faces
+             * @description Most faces of a mesh.
+             */
             max_faces: number;
             /**
              * Max Wait Seconds
@@ -939,16 +1054,21 @@ export interface components {
          * @description A share link of a job.
          */
         Share: {
-            /** Id */
+            /**
+             * Id
+             * @description Names the link when it is revoked.
+             */
             id: string;
             /**
              * Created At
              * Format: date-time
+             * @description When the link was created.
              */
             created_at: string;
             /**
              * Expires At
              * Format: date-time
+             * @description When it stops working.
              */
             expires_at: string;
             /**
@@ -973,7 +1093,10 @@ export interface components {
          * @description A large input that is uploaded separately and then referenced by jobs.
          */
         Upload: {
-            /** Id */
+            /**
+             * Id
+             * @description The id in the upload's address.
+             */
             id: string;
             /**
              * Offset

@@ -91,6 +91,6 @@ def test_equal_results_give_identical_files(tmp_path: Path) -> None:
 
 def test_alembic_output_is_refused_without_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pliant.worker.artifacts.scenes.alembic.available", lambda: False)
-    with pytest.raises(InvalidInput, match=r"pliant\[alembic\]") as refused:
+    with pytest.raises(InvalidInput, match=r"\.\[alembic\]") as refused:
         kinds_for(Options(outputs=("abc",)))
     assert (refused.value.code, refused.value.field) == ("output_unavailable", "options.outputs")

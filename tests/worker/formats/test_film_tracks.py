@@ -85,7 +85,7 @@ def plain_file(folder: Path) -> Path:
 def test_a_film_job_reads_the_file_as_a_tracks_job_does(tmp_path: Path) -> None:
     file = film_file(tmp_path / "tracks.npz")
     alone = read_inputs(tracks=file, options=Options(stride=2))
-    job = read_tracked(file, Tracked(container="mp4", warnings=()), Options(stride=2))
+    job = read_tracked(file, Tracked(container="mp4", fps=30.0, warnings=()), Options(stride=2))
     np.testing.assert_array_equal(alone.tracks.points, job.tracks.points)
     np.testing.assert_array_equal(alone.tracks.visible, job.tracks.visible)
     assert alone.mesh is not None

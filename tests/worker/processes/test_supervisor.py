@@ -186,6 +186,21 @@ def test_two_supervisors_on_one_directory_are_refused(tmp_path: Path) -> None:
     Valkey.claim(tmp_path).release()
 
 
+def test_an_interruption_while_the_server_starts_ends_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+
+    def interrupted(_: Valkey, process: subprocess.Popen[bytes]) -> None:
+        started.append(process)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Valkey, "wait", interrupted)
+    claimed = Valkey.claim(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        claimed.start()
+    assert started[0].wait(10) != 0
+    claimed.release()
+
+
 def test_an_orphaned_server_is_stopped_and_its_data_is_kept(tmp_path: Path) -> None:
     first = Valkey.claim(tmp_path)
     orphan = first.start()

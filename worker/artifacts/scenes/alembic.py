@@ -1,4 +1,4 @@
-"""The moving mesh as Alembic (`alembic3d`, an extra: `pip install 'pliant[alembic]'`), for Blender, Maya, Houdini and others."""
+"""The moving mesh as Alembic (`alembic3d`, the extra `alembic`), for Blender, Maya, Houdini and others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The moving mesh as USD with time samples (`usd-core`, an extra: `pip install 'pliant[usd]'`)."""
+"""The moving mesh as USD with time samples (`usd-core`, the extra `usd`)."""
 
 from __future__ import annotations
 
