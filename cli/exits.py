@@ -7,6 +7,7 @@ import os
 import sys
 from enum import IntEnum
 from importlib import import_module
+from itertools import pairwise
 from typing import Any
 
 from pliant.cli.extras import SERVER_MODULES, MissingExtra
@@ -62,6 +63,10 @@ _CODES: tuple[tuple[str, str, Exit], ...] = (
 """Exit codes of error classes; the first match applies. Classes are given by name, so that no module is imported for the lookup."""
 
 
+_STORAGE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
+"""Errors of a file system, which name no file if they occur while writing."""
+
+
 def code_of(fault: BaseException) -> Exit | None:
     """Return the exit code of an expected error, or None for a bug, whose traceback is shown."""
     if isinstance(fault, KeyboardInterrupt):
@@ -69,7 +74,7 @@ def code_of(fault: BaseException) -> Exit | None:
     for module, name, code in _CODES:
         if module in sys.modules and isinstance(fault, getattr(import_module(module), name, ())):
             return code
-    if isinstance(fault, OSError) and (fault.filename is not None or fault.errno in (errno.ENOSPC, errno.EDQUOT)):
+    if isinstance(fault, OSError) and (fault.filename is not None or fault.errno in _STORAGE):
         return Exit.REFUSED
     return None
 
@@ -89,6 +94,8 @@ def sentence_of(fault: BaseException, job: str | None = None, *, others: int = 0
                 f"`pliant watch {job}` follows this one, `pliant cancel {job}` stops it."
             )
         return f"Interrupted. Job {job} continues: `pliant watch {job}` follows it, `pliant cancel {job}` stops it."
+    if hasattr(fault, "format_message"):  # of Click or Typer
+        return str(fault.format_message())
     if isinstance(fault, OSError) and fault.strerror is not None and type(fault).__module__ == "builtins":
         name = "" if fault.filename is None else f"{os.fsdecode(fault.filename)}: "
         return f"{name}{fault.strerror}."
@@ -98,8 +105,29 @@ def sentence_of(fault: BaseException, job: str | None = None, *, others: int = 0
 class Guarded(TyperGroup):
     """Group of all commands, which turns errors into a message and an exit code."""
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command and its arguments, of which none may be empty: a path would stand for the current folder.
+
+        Raises
+        ------
+        BadArgument
+            An argument is empty, and is not the value of an option that is empty by default.
+        """
+        from pliant.client.errors import BadArgument
+
+        name, command, rest = super().resolve_command(ctx, args)
+        blank = (
+            {spelled for each in command.params if each.default == "" for spelled in each.opts} if command else set()
+        )
+        if any(text == "" and before not in blank for before, text in pairwise(["", *rest])):
+            raise BadArgument(
+                "Expected a path or a value, got an empty argument. Check the variable that it comes from."
+            )
+        return name, command, rest
+
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
+        as_json = "--json" in ctx.args
         try:
             return super().invoke(ctx)
         except (Exception, KeyboardInterrupt) as caught:
@@ -110,14 +138,14 @@ class Guarded(TyperGroup):
             if code is None:
                 if hasattr(fault, "option_name") and hasattr(fault, "possibilities"):
                     _suggest(fault)
-                raise
+                if not (as_json and hasattr(fault, "format_message")):
+                    raise
+                code = Exit.USAGE
             from pliant.cli.show import show_fault
 
             session = ctx.obj
             sentence = sentence_of(fault, getattr(session, "following", None), others=getattr(session, "others", 0))
-            show_fault(
-                fault, sentence, code, as_json=bool(session is not None and session.json), url=getattr(session, "url", None),
-            )  # fmt: skip
+            show_fault(fault, sentence, code, as_json=as_json, url=getattr(session, "url", None))
             ctx.exit(code)
 
 

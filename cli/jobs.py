@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from pliant.cli.films import is_film
 from pliant.cli.ids import find_job
-from pliant.cli.paths import check_inputs, different_files, output_folder
+from pliant.cli.paths import check_inputs, different_files, output_folder, results_folder
 from pliant.cli.session import (
     HOME,
     LINE_EVERY,
@@ -88,8 +88,8 @@ def submit(
         raise typer.Exit(batch.exit_code)
     tracks = chosen[0]
     check_inputs(tracks, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=region)
-    if output is not None:
-        output_folder(output, force=force)
+    if output is not None:  # a named job may be an earlier one, whose files may be here already
+        output_folder(output, force=force or job_id is not None or key is not None)
     given = {
         "film" if is_film(tracks, region) else "tracks": tracks, "region": region, **parts, "options": options,
         "name": name_of(name, tracks), "job_id": job_id, "idempotency_key": key, "priority": priority, "timeout": timeout,
@@ -158,8 +158,11 @@ def result(
     as_json: Json = False,
 ) -> None:
     """Download the files of a finished job. Interrupted downloads resume."""
+    from pliant.client.errors import BadArgument
     from pliant.client.progress import progress_bar
 
+    if fps is not None and not make:
+        raise BadArgument("--fps: expected --make beside it. The stored files keep the frame rate of their job.")
     with ctx.obj.client(url, as_json=as_json) as client:
         found = find_job(client, job).id
         if make:
@@ -171,8 +174,7 @@ def result(
         else:
             done = client.result(found, load=False, timeout=timeout)
         changed = different_files(done.job, output, only)
-        output_folder(output, force=force, files=changed)
-        with progress_bar(line_every=LINE_EVERY) as bar:
+        with results_folder(output, force=force, files=changed), progress_bar(line_every=LINE_EVERY) as bar:
             paths = done.download(output, names=only, on_download=bar.on_download, timeout=timeout)
     if as_json:
         print_json({name: str(path) for name, path in paths.items()})
@@ -233,10 +235,10 @@ def delete(
 ) -> None:
     """Delete jobs and their files from the service."""
     with ctx.obj.client(url, as_json=as_json) as client:
-        found = [find_job(client, job) for job in jobs]  # find all of them before deleting the first
-        for job in found:
+        found = {job.id: job for job in [find_job(client, job) for job in jobs]}  # find all before deleting the first
+        for job in found.values():
             job.delete()
-    ids = [job.id for job in found]
+    ids = list(found)
     if as_json:
         print_json({"deleted": ids})
     else:

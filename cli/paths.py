@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -111,18 +112,25 @@ def installation(settings: Settings) -> None:
         )
 
 
-def output_file(path: Path | None, option: str, *, force: bool, others: Iterable[Path | None] = ()) -> None:
+def output_file(
+    path: Path | None, option: str, *, force: bool, suffixes: tuple[str, ...] = (), others: Iterable[Path | None] = ()
+) -> None:
     """Check that a file can be written, before starting the work that produces it. `others` are the command's other files.
 
     Raises
     ------
     BadArgument
-        The path is a folder, a device, one of `others` or, without `force`, an existing file; or its folder is missing or not writable.
+        The path is a folder, a device, one of `others` or, without `force`, an existing file; its name ends in none of `suffixes`; or its
+        folder is missing or not writable.
+    OSError
+        The system allows no such name.
     """
     from pliant.client.errors import BadArgument
 
     if path is None:
         return
+    with suppress(FileNotFoundError, NotADirectoryError):
+        path.lstat()
     if path.is_dir():
         raise BadArgument(f"{option}: expected a file, got the folder {path}. Give a file in it.")
     if path.exists() and not path.is_file():
@@ -135,12 +143,19 @@ def output_file(path: Path | None, option: str, *, force: bool, others: Iterable
         raise BadArgument(f"{option}: {path} exists already. Choose another name, or replace it with --force.")
     if any(other is not None and other.resolve() == path.resolve() for other in others):
         raise BadArgument(f"{option}: {path} is also another file of this command. Choose another name.")
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise BadArgument(
+            f"{option}: expected a name that ends in {' or '.join(suffixes)}, got {path}. Choose another name."
+        )
 
 
 @contextmanager
 def written_aside(path: Path) -> Iterator[Path]:
-    """Yield the path of a hidden file to write, and move it to `path` at the end; after an error `path` is unchanged."""
-    aside = path.with_name(f".{path.name}.part")
+    """Yield the path of a hidden file to write, and move it to `path` at the end; after an error `path` is unchanged.
+
+    Its name is short, whatever the length of the other.
+    """
+    aside = path.with_name(f".{secrets.token_hex(4)}.part")
     try:
         yield aside
         aside.replace(path)

@@ -27,7 +27,7 @@ UNESTIMATED = "The error is not estimated"
 
 def out() -> Console:
     """Console on standard output; created per call, so that it follows redirections. Brackets in names and messages are no markup."""
-    return Console(highlight=False, soft_wrap=True)
+    return Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 
 METRIC_MEANINGS: Mapping[str, str] = {
@@ -48,7 +48,7 @@ METRIC_MEANINGS: Mapping[str, str] = {
 
 def err() -> Console:
     """Console on standard error, for everything but the command's output."""
-    return Console(stderr=True, highlight=False, soft_wrap=True)
+    return Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 
 def show_warnings(warnings: Iterable[str], screen: Console | None = None) -> None:

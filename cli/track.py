@@ -53,9 +53,10 @@ def track(
     one_numerical_thread()
     input_file(region, "--region")
     others = [film, region]
-    for path, name in ((output, "--output"), (preview, "--preview")):
-        output_file(path, name, force=force, others=others)
+    for path, name, suffixes in ((output, "--output", (".npz",)), (preview, "--preview", (".jpg", ".jpeg"))):
+        output_file(path, name, force=force, suffixes=suffixes, others=others)
         others.append(path)
+    _preview_outside(film, preview)
     from pliant.tracking import track_film
 
     shown = 0
@@ -82,9 +83,25 @@ def track(
     show_warnings(tracked.warnings[shown:])
     count, points = tracked.visibility.shape
     seen = f"visible in {tracked.visibility.mean():.0%}"
-    out().print(f"{output}: {points} points in {count} frames, {seen}.", markup=False)
+    out().print(f"{output}: {points} points in {count} frames, {seen}.")
     if preview is not None:
-        out().print(f"{preview}: the tracks over {len(tracked.thumbnails)} of the frames.", markup=False)
+        out().print(f"{preview}: the tracks over {len(tracked.thumbnails)} of the frames.")
+
+
+def _preview_outside(film: Path, preview: Path | None) -> None:
+    """Check that the preview does not become a frame of a film that is a folder of pictures.
+
+    Raises
+    ------
+    BadArgument
+        It would be written into that folder.
+    """
+    from pliant.client.errors import BadArgument
+
+    if preview is not None and film.is_dir() and preview.parent.resolve() == film.resolve():
+        raise BadArgument(
+            f"--preview: expected a file outside the film's folder, got {preview}, which would be a frame. Choose another folder."
+        )
 
 
 @contextmanager

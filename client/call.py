@@ -68,9 +68,20 @@ def base_of(url: str) -> str:
 
 
 def headers_of(token: str | None, more: Mapping[str, str] | None) -> dict[str, str]:
-    """Return the headers of every request; the caller's own take precedence."""
+    """Return the headers of every request; the caller's own take precedence.
+
+    Raises
+    ------
+    BadArgument
+        The token has characters that no token has; the message does not show it.
+    """
     headers = {"User-Agent": f"pliant-client/{version('pliant')}"}
     if token is not None:
+        token = token.strip()
+        if not token.isascii() or not token.isprintable() or " " in token:
+            raise BadArgument(
+                "token, or PLIANT_TOKEN: expected ASCII letters, digits and signs, got others. Copy the token again."
+            )
         headers["Authorization"] = f"Bearer {token}"
     return {**headers, **(more or {})}
 

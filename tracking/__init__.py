@@ -5,7 +5,8 @@
     tracked = track_film("face.mp4", region="mask.png")
     tracked.save_npz("tracks.npz")
 
-Needs OpenCV: `pip install 'pliant[film]'`. Names are imported on first access, so that opening a film does not load the tracker.
+Needs OpenCV, the extra `film`: `pip install '.[film]'` in Pliant's source folder. Names are imported on first access, so that
+opening a film does not load the tracker.
 """
 
 if __name__ != "pliant.tracking":
@@ -14,7 +15,9 @@ if __name__ != "pliant.tracking":
 try:
     import cv2 as _cv2
 except ImportError as error:
-    raise ImportError("Tracking films needs OpenCV. Install it with: pip install 'pliant[film]'") from error
+    raise ImportError(
+        "Tracking films needs OpenCV. Install the extra film: pip install '.[film]' in Pliant's source folder"
+    ) from error
 
 from importlib import import_module
 from typing import TYPE_CHECKING

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pliant.tracking.flow import Bools, Floats, Grey, sample
+from pliant.tracking.flow import Bools, Floats, Grey, in_picture, sample
 
 LEAST_CORRELATION = 0.6
 """Correlation below which a point is hidden: two thirds of the patch's variance (1 − .6²) are then unexplained, which closed flow cycles do
@@ -59,21 +59,22 @@ class Appearance:
         """Compare a frame with the template at tracked points `(P, 2)`; return which visible points stay visible, shape `(P,)`.
 
         The patches follow the tracks' local affine maps, estimated from visible neighbours on the grid. The noise variance is added to the
-        patches' own, so that two flat patches count as equal. The result does not depend on the number of threads in `pool`.
+        patches' own, so that two flat patches count as equal. Points outside the picture are hidden. The result does not depend on the
+        number of threads in `pool`.
         """
         seen = np.zeros(len(points), dtype=bool)
         seen[visible] = self._resembles(frame, points, visible, visible, pool)
-        return self._without_edges(seen)
+        return self._without_edges(seen) & in_picture(points, frame.shape)
 
     def found(self, frame: Grey, points: Floats, visible: Bools) -> Bools:
         """Compare a frame with the template at hidden points only.
 
-        Return the visible points and those hidden ones that look like the template and do not lie beside points that stay hidden, see
-        `LOST_NEIGHBOURS`.
+        Return, of those in the picture, the visible points and the hidden ones that look like the template and do not lie beside points
+        that stay hidden, see `LOST_NEIGHBOURS`.
         """
         alike = visible.copy()
         alike[~visible] = self._resembles(frame, points, ~visible, np.ones_like(visible), None)
-        return visible | self._without_edges(alike)
+        return (visible | self._without_edges(alike)) & in_picture(points, frame.shape)
 
     def _without_edges(self, seen: Bools) -> Bools:
         """Hide points that have `LOST_NEIGHBOURS` hidden neighbours, or one at the edge of the grid."""

@@ -9,6 +9,9 @@ from __future__ import annotations
 
 from pliant.schemas.invalid import Invalid
 
+FILM_SLOWLY = "Film more slowly and with more light, so that successive frames overlap and are not blurred."
+"""Hint for films in which points are lost."""
+
 
 class TrackingError(Exception):
     """The film could not be tracked."""

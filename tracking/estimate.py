@@ -42,7 +42,7 @@ def estimate(
     FilmError
         The film cannot be decoded, or the region does not fit it.
     """
-    grey, scale = _frame(film, region_frame, longest_side)
+    grey, scale = _frame(film if region is None else film.reaching(region_frame), region_frame, longest_side)
     height, width = grey.shape
     mask = np.ones((height, width), dtype=bool)
     if region is not None:

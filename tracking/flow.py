@@ -94,11 +94,14 @@ def match(forward: Floats, backward: Floats, points: Floats) -> Match:
     back = sample(backward, landed[:, None])[:, 0]
     gap = ((step + back) ** 2).sum(axis=1)
     lengths = (step**2).sum(axis=1) + (back**2).sum(axis=1)
-    height, width = forward.shape[:2]
-    outside = (landed < 0).any(axis=1) | (landed > (width - 1, height - 1)).any(axis=1)
-    return Match(
-        landed, gap, (gap >= CYCLE_RATIO * lengths + CYCLE_FLOOR) | outside, _on_boundary(backward, landed, back)
-    )
+    lost = (gap >= CYCLE_RATIO * lengths + CYCLE_FLOOR) | ~in_picture(landed, forward.shape)
+    return Match(landed, gap, lost, _on_boundary(backward, landed, back))
+
+
+def in_picture(points: Floats, shape: tuple[int, ...]) -> Bools:
+    """Return which points `(P, 2)` lie between the outermost pixel centres of a picture `(H, W, …)`."""
+    height, width = shape[:2]
+    return np.asarray(((points >= 0) & (points <= (width - 1, height - 1))).all(axis=1))
 
 
 def sample(image: Floats, places: Floats) -> Floats:

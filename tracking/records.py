@@ -104,7 +104,8 @@ class TrackedFilm:
     """Texture coordinates in the template image, shape `(P, 2)`, in [0, 1]: u right, v down, (0, 0) its upper left corner."""
 
     thumbnails: NDArray[np.uint8]
-    """Some frames in colour, shape `(N, h, w, 3)`: the part that all visible points occupy, enlarged or reduced to w = 320 pixels."""
+    """Some frames in colour, shape `(N, h, w, 3)`: the part that all visible points occupy, enlarged or reduced to w = 320 pixels, and
+    stretched or squeezed to h from 80 to 960."""
 
     thumbnail_view: View
     """That part: first column and row, width and height in pixels of the film."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, UnidentifiedImageError
 from pliant.tracking.appearance import Appearance
+from pliant.tracking.decoding.pictures import upright
 from pliant.tracking.errors import FilmError, TrackingStopped
 from pliant.tracking.flow import Bools, Floats, Grey, dense_flow, match
 from pliant.tracking.records import OnStep, TrackingStep
@@ -29,6 +30,12 @@ More may be if they are at most twice as many as the white and as the black ones
 (standard deviation up to 2 % of the width, of discs 0.1 to 0.97 of the picture's height) keep to that; photographs and drawings do not.
 """
 
+INSIDE = 128
+"""Level of 0 to 255 from which a pixel of a mask is inside: the middle of an outline."""
+
+FARTHEST = 1e6
+"""Largest coordinate of a polygon's corner, pixels: OpenCV fills polygons in 32-bit fixed point. No film is larger."""
+
 LONG_STEP = 2
 """Frames per step when a region is carried to the template; longer steps lose fast motion."""
 
@@ -38,7 +45,7 @@ def read_region(region: Region, size: tuple[int, int]) -> Bools:
 
     The region is the path of a mask picture of the film's size, an array `(H, W)` (bool, or uint8 with 128 and above inside), or a polygon
     of pixels `(N, 2)` with N ≥ 3. In pictures with transparency, opaque pixels are inside. Pictures must be black and white, except for a
-    soft outline.
+    soft outline; as the film's own, they are turned by their EXIF orientation.
 
     Raises
     ------
@@ -46,21 +53,27 @@ def read_region(region: Region, size: tuple[int, int]) -> Bools:
         Not a mask or polygon, not black and white, another size than the film's, or empty.
     """
     if isinstance(region, str | Path):
-        mask = _from_picture(Path(region), size)
+        levels = _from_picture(Path(region), size)
     else:
         try:
             given = np.asarray(region)
-        except ValueError:
-            given = np.full((1, 2), np.nan)  # rows of several lengths
+        except ValueError as error:
+            raise _wrong_polygon("rows of several lengths") from error
         polygon = given.ndim == 2 and given.shape[1] == 2 and given.dtype != bool and given.shape != size[::-1]
-        mask = _from_polygon(given, size) if polygon else _from_array(given)
+        levels = _from_polygon(given, size) if polygon else _from_array(given)
+    mask = np.asarray(levels >= INSIDE)
     if mask.shape != size[::-1]:
         raise _refusal(
             "wrong_region_size", f"a mask of {size[0]}×{size[1]} pixels, the film's size",
             f"{mask.shape[1]}×{mask.shape[0]}", "Draw the region on a frame of this film, upright as it is shown.",
         )  # fmt: skip
     if not mask.any():
-        raise _refusal("empty_region", "some pixels inside", "none", "Draw around the object to track.")
+        brightest = int(levels.max(initial=0))
+        got = "none" if brightest == 0 else f"none: the brightest level is {brightest}, of 255"
+        raise _refusal(
+            "empty_region", "some pixels inside", got,
+            "Draw around the object to track." if brightest == 0 else f"Levels of {INSIDE} and above are inside: make the object white.",
+        )  # fmt: skip
     return mask
 
 
@@ -86,7 +99,6 @@ def transport(
     direction = 1 if end > start else -1
     stations = [*range(start, end, direction * LONG_STEP), end]
     for before, here in itertools.pairwise(stations):
-        on_step(TrackingStep("locate", abs(before - start), abs(end - start)))
         if should_stop():
             raise TrackingStopped
         ways = [(start, seeds.points, np.ones_like(seen), np.zeros_like(variance)), (before, points, seen, variance)]
@@ -101,6 +113,7 @@ def transport(
         every = np.arange(len(best))
         points = np.stack([m.points for m in found])[best, every]
         seen, variance = appearance.agrees(frame, points, sees[best, every]), sums[best, every]
+        on_step(TrackingStep("locate", abs(here - start), abs(end - start)))
     return _cover(points, seen, seeds, read(end).shape)
 
 
@@ -116,34 +129,38 @@ def _cover(points: Floats, seen: Bools, seeds: Seeds, shape: tuple[int, ...]) ->
     return np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disc) > 0)
 
 
-def _from_picture(path: Path, size: tuple[int, int]) -> Bools:
+def _from_picture(path: Path, size: tuple[int, int]) -> Grey:
     try:
+        if path.exists() and not path.is_file():
+            raise OSError("a folder, a pipe or a device")
         with Image.open(path, formats=("PNG", "JPEG", "WEBP", "BMP", "GIF")) as picture:
-            if picture.size != size:
-                return np.zeros(picture.size[::-1], dtype=bool)  # rejected for its size without being decoded
-            if picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info:
-                alpha = np.asarray(picture.convert("RGBA"))[..., 3]
-                if alpha.min() < 128:
-                    return _from_levels(alpha)
-            return _from_levels(np.asarray(picture.convert("L")))
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            if sorted(picture.size) != sorted(size):
+                return np.zeros(picture.size[::-1], dtype=np.uint8)  # rejected for its size without being decoded
+            turned = upright(picture)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        fault = "its format is not recognised" if isinstance(error, UnidentifiedImageError) else error
         raise _refusal(
-            "unreadable_region", "a PNG, JPEG, WebP, BMP or GIF picture", f"{path.name}: {error}",
+            "unreadable_region", "a PNG, JPEG, WebP, BMP or GIF picture", f"{path.name}: {fault}",
             "Save the mask as PNG: white inside, black outside.",
         ) from error  # fmt: skip
+    if turned.mode in ("RGBA", "LA", "PA") or "transparency" in turned.info:
+        alpha = np.asarray(turned.convert("RGBA"))[..., 3]
+        if alpha.min() < INSIDE:
+            return _black_and_white(alpha)
+    return _black_and_white(np.asarray(turned.convert("L")))
 
 
-def _from_array(given: NDArray[np.generic]) -> Bools:
+def _from_array(given: NDArray[np.generic]) -> Grey:
     if given.ndim != 2 or given.dtype not in (np.dtype(bool), np.dtype(np.uint8)):
         raise _refusal(
             "wrong_region", "a mask (H, W) of bool or uint8, or a polygon (N, 2) with N ≥ 3",
             f"shape {given.shape}, dtype {given.dtype}", "Convert the array.",
         )  # fmt: skip
-    return np.asarray(given if given.dtype == bool else np.asarray(given, dtype=np.uint8) >= 128, dtype=bool)
+    return np.where(given, np.uint8(255), np.uint8(0)) if given.dtype == bool else np.asarray(given, dtype=np.uint8)
 
 
-def _from_levels(levels: NDArray[np.uint8]) -> Bools:
-    """Return the pixels of a picture that are white.
+def _black_and_white(levels: Grey) -> Grey:
+    """Return the levels of a picture after checking them.
 
     Raises
     ------
@@ -157,22 +174,27 @@ def _from_levels(levels: NDArray[np.uint8]) -> Bools:
             "wrong_region", "a black and white mask", f"a picture in which {between:.0%} of the pixels are in between",
             "Paint the object white and everything else black.",
         )  # fmt: skip
-    return np.asarray(levels >= 128)
+    return levels
 
 
-def _from_polygon(given: ArrayLike, size: tuple[int, int]) -> Bools:
+def _from_polygon(given: ArrayLike, size: tuple[int, int]) -> Grey:
     try:
         corners = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        corners = np.full((1, 2), np.nan)
-    if len(corners) < 3 or not np.isfinite(corners).all() or np.abs(corners).max() > 1e6:
-        raise _refusal(
-            "wrong_polygon", "a polygon of at least 3 corners with finite pixel coordinates",
-            f"{len(corners)} corners", "Draw around the object to track.",
-        )  # fmt: skip
+    except (TypeError, ValueError) as error:
+        raise _wrong_polygon("corners that are no numbers") from error
+    if len(corners) < 3:
+        raise _wrong_polygon(f"{len(corners)} corners")
+    far = np.flatnonzero(~(np.abs(corners) <= FARTHEST).all(axis=1))  # NaN as well
+    if far.size:
+        raise _wrong_polygon("the corner ({:g}, {:g})".format(*corners[far[0]]))
     mask = np.zeros(size[::-1], dtype=np.uint8)
-    cv2.fillPoly(mask, [np.round(corners).astype(np.int32)], 1)
-    return np.asarray(mask > 0)
+    cv2.fillPoly(mask, [np.round(corners).astype(np.int32)], 255)
+    return mask
+
+
+def _wrong_polygon(got: str) -> FilmError:
+    expected = f"a polygon of at least 3 corners with finite pixel coordinates up to {FARTHEST:,.0f}"
+    return _refusal("wrong_polygon", expected, got, "Draw around the object to track.")
 
 
 def _refusal(code: str, expected: str, got: str, hint: str) -> FilmError:

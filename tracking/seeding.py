@@ -43,11 +43,11 @@ def default_step(region: Bools) -> float:
     return float(np.clip(np.sqrt(region.sum() / WANTED_POINTS), *GRID_STEPS))
 
 
-def place(template: Grey, region: Bools, *, step: float, everywhere: bool = False) -> tuple[Seeds, float]:
+def place(template: Grey, region: Bools, *, step: float, everywhere: bool = False) -> tuple[Seeds, float | None]:
     """Place points on a grid of `step` pixels inside a region, where there is texture or, with `everywhere`, in all cells.
 
     Single cells without texture between textured ones are kept, so that the mesh has no pinholes. Returns the points that belong to at
-    least one face, and the share of the region's cells that have texture.
+    least one face, and the share of the region's cells that have texture; None if no cell lies in the region.
     """
     height, width = template.shape
     x, y = (np.arange(min(step, side) / 2, side - 1, step) for side in (width, height))
@@ -58,7 +58,7 @@ def place(template: Grey, region: Bools, *, step: float, everywhere: bool = Fals
     if everywhere:
         return number(plane, inside), 1.0
     closed = cv2.morphologyEx(rough.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
-    share = float(rough.sum() / max(inside.sum(), 1))
+    share = float(rough.sum() / inside.sum()) if inside.any() else None
     return number(plane, closed & inside), share
 
 

@@ -35,7 +35,7 @@ BROKEN_SHARE = 0.95
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Survey:
-    """Result of one pass; rows are the selected frames."""
+    """Result of one pass; rows are the selected frames and those that lead to the region's frame."""
 
     indices: NDArray[np.int64]
     """Frame numbers in the whole film, shape `(N,)`."""
@@ -45,6 +45,9 @@ class Survey:
 
     sharpness: NDArray[np.float64]
     """Variance of the Laplacian over the variance of the grey levels, shape `(N,)`."""
+
+    used: tuple[int, int]
+    """First of the rows of the selected frames, and the row after the last."""
 
     cuts: tuple[int, ...]
     """Rows at which a new shot begins."""
@@ -57,14 +60,20 @@ class Survey:
 
 
 def survey(
-    film: Film, store: FrameStore, *, longest_side: int, on_step: OnStep, should_stop: Callable[[], bool]
+    film: Film,
+    store: FrameStore,
+    *,
+    reached: int | None,
+    longest_side: int,
+    on_step: OnStep,
+    should_stop: Callable[[], bool],
 ) -> Survey:
-    """Decode a film into a store of grey frames in the tracker's size.
+    """Decode a film into a store of grey frames in the tracker's size: the selected ones and those from there to the frame `reached`.
 
     Raises
     ------
     FilmError
-        Fewer than 3 frames, or an error of `Film.frames`.
+        Fewer than 3 selected frames, or an error of `Film.reaching` or `Film.frames`.
     TrackingStopped
         `should_stop` returned True.
     """
@@ -72,7 +81,8 @@ def survey(
     size = (max(16, round(film.size[0] * scale)), max(16, round(film.size[1] * scale)))
     indices, times, sharpness, likeness = [], [], [], [1.0]
     before: Grey | None = None
-    for frame in film.frames():
+    whole = film if reached is None else film.reaching(reached)
+    for frame in whole.frames():
         if should_stop():
             raise TrackingStopped
         grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
@@ -89,11 +99,13 @@ def survey(
             likeness.append(_likeness(before, small))
         before = small
         on_step(TrackingStep("read", len(indices), None))
-    if len(indices) < LEAST_FRAMES:
-        raise film.too_few_frames(len(indices))
+    start, stop, _ = film.selection
+    first, last = np.searchsorted(indices, [start, np.inf if stop is None else stop]).tolist()
+    if last - first < LEAST_FRAMES:
+        raise film.too_few_frames(last - first)
     return Survey(
-        np.array(indices), np.array(times), np.array(sharpness), find_cuts(np.array(likeness)),
-        (np.array(size) / film.size).astype(np.float32), _ends_early(film, indices[-1]),
+        np.array(indices), np.array(times), np.array(sharpness), (first, last), find_cuts(np.array(likeness)),
+        (np.array(size) / film.size).astype(np.float32), _ends_early(whole, indices[-1]),
     )  # fmt: skip
 
 

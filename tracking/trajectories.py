@@ -15,11 +15,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 from pliant.solver import Tracks
+from pliant.solver.records import MIN_POINTS
 from pliant.solver.tracks.completion import choose_points, coefficients_of, fit_basis, predict
 from pliant.solver.tracks.normalization import normalize
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.chaining import FIRST_STEPS, Chain, OnFrame, Read
-from pliant.tracking.errors import TrackingStopped
+from pliant.tracking.errors import FILM_SLOWLY, FilmError, TrackingStopped
 from pliant.tracking.flow import Bools, Floats
 from pliant.tracking.registration import Registration
 
@@ -37,11 +38,18 @@ def move_to_expected(chained: Chain, should_stop: Callable[[], bool]) -> None:
 
     Raises
     ------
+    FilmError
+        Code tracks_lost: too few points are visible in more than the template.
     TrackingStopped
         `should_stop` returned True; some points may have been moved.
     """
     weight, random = chained.confidence, np.random.default_rng(0)
     chosen = choose_points(weight, random)
+    if len(chosen) < MIN_POINTS:
+        raise FilmError(
+            "tracks_lost", field="film", expected=f"at least {MIN_POINTS} points that stay visible beyond the template",
+            got=str(len(chosen)), hint=FILM_SLOWLY,
+        )  # fmt: skip
     sample = normalize(Tracks.from_arrays(chained.points[:, chosen], weight[:, chosen]))
     basis, spread, scale = fit_basis(sample.points, np.asarray(sample.visible), random, should_stop=should_stop)
     centre = sample.centroid[:, None]
@@ -74,8 +82,8 @@ def track_again(
 
     Raises
     ------
-    TrackingStopped
-        `should_stop` returned True.
+    FilmError, TrackingStopped
+        See `move_to_expected`.
     """
     move_to_expected(chained, should_stop)
     chained.points[template] = appearance.points

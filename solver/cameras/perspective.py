@@ -235,7 +235,7 @@ def corrected_moments(view: Perspective, normalized: Normalized) -> tuple[Floats
 
 
 def _mean_corrected(view: Perspective, normalized: Normalized) -> Floats:
-    """Return the mean corrected point of all points, relative to the principal point, shape `(F, 2)`, from depths about the sample's mean."""
+    """Return the mean corrected point relative to the principal point, shape `(F, 2)`, from depths about the sample's mean."""
     total, used = np.zeros((len(normalized.points), 2)), 0
     origin = _origin(view, _corrected_by(view, view.sample).mean(axis=1))
     for _, points in spans(normalized, view.filling):

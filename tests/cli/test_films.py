@@ -91,6 +91,10 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
     refused = inspect(film, "--mesh", "3x4")
     assert refused.exit_code == Exit.REFUSED
     assert "--mesh: expected tracks, got a film" in refused.output
+    for name in ("region_frame", "template_frame"):
+        refused = inspect(film, "-O", f"{name}=1000")
+        assert refused.exit_code == Exit.REFUSED
+        assert f"options.{name}: expected a frame number from 0 to 9, got 1000." in refused.output
 
 
 def test_a_folder_of_two_pictures_and_tracks_is_described_as_it_was_read(tmp_path: Path) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pliant.cli import app
-from pliant.cli.exits import Exit
+from pliant.cli.exits import Exit, code_of
 from pliant.cli.session import Session
 from pliant.client import Problem
 from pliant.service.testing import InMemoryService
@@ -127,6 +129,60 @@ def test_result_can_fetch_a_single_file(run: Run, tracks: Path, tmp_path: Path) 
     assert [path.name for path in (tmp_path / "some").iterdir()] == ["report.json"]
 
 
+def test_an_empty_name_is_the_default(run: Run, tracks: Path) -> None:
+    assert submitted(run, tracks, "--name", "")["name"] == tracks.stem
+
+
+def test_usage_errors_are_json_with_json(run: Run) -> None:
+    ran = run("submit", "--json")
+    assert ran.exit_code == Exit.USAGE
+    assert json.loads(ran.stderr)["exit_code"] == Exit.USAGE
+    assert "Missing argument" in json.loads(ran.stderr)["detail"]
+
+
+def test_names_with_brackets_are_shown_as_they_are(run: Run, tmp_path: Path) -> None:
+    file = tmp_path / "named.npz"
+    tracks = np.random.default_rng(1).normal(size=(5, 12, 2))
+    np.savez(file, tracks=tracks, point_names=["[/b]nose", "[red]eye", *map(str, range(10))])
+    ran = run("submit", file, "--wait")
+    assert ran.exit_code == 0, ran.output
+    assert "[/b]nose" in ran.stdout
+
+
+def test_a_named_job_is_downloaded_again_into_the_same_folder(run: Run, tracks: Path, tmp_path: Path) -> None:
+    for _ in range(2):
+        ran = run("submit", tracks, "--id", "again", "-o", tmp_path / "out")
+        assert ran.exit_code == 0, ran.output
+        (tmp_path / "out" / "report.json").unlink()
+    (tmp_path / "out" / "shapes.npz").write_text("mine")
+    assert run("submit", tracks, "--id", "again", "-o", tmp_path / "out").exit_code == Exit.REFUSED
+    assert (tmp_path / "out" / "shapes.npz").read_text() == "mine"
+
+
+def test_a_job_named_twice_is_deleted_once(run: Run, tracks: Path) -> None:
+    job = submitted(run, tracks)["id"]
+    run("watch", job)
+    ran = run("delete", job, job[:-1], "--json")
+    assert ran.exit_code == 0, ran.output
+    assert json.loads(ran.stdout) == {"deleted": [job]}
+
+
+@pytest.mark.parametrize("token", ["ü€", "a b", "a\x1bb"])
+def test_a_token_that_no_header_can_carry_is_refused_without_showing_it(
+    token: str, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PLIANT_TOKEN", token)
+    ran = run("list")
+    assert ran.exit_code == Exit.REFUSED
+    assert "PLIANT_TOKEN: expected ASCII" in ran.stderr
+    assert token not in ran.stderr
+
+
+@pytest.mark.parametrize("number", [errno.EFBIG, errno.EIO, errno.EROFS])
+def test_errors_of_the_file_system_have_no_traceback(number: int) -> None:
+    assert code_of(OSError(number, os.strerror(number))) is Exit.REFUSED
+
+
 @pytest.mark.usefixtures("endless")
 def test_cancel_and_retry(run: Run, tracks: Path) -> None:
     job = submitted(run, tracks)["id"]
@@ -157,6 +213,10 @@ def test_options_lists_every_option_of_this_installation_or_a_service(run: Run, 
         (["result", "JOB"], Exit.NOT_NOW, "there is no result yet"),
         (["delete", "JOB"], Exit.NOT_NOW, "Cancel it first"),
         (["retry", "JOB"], Exit.NOT_NOW, "Wait until it ends"),
+        (["submit", ""], Exit.REFUSED, "got an empty argument"),
+        (["submit", "TRACKS", "--mesh", ""], Exit.REFUSED, "got an empty argument"),
+        (["submit", "TRACKS", "--jso"], Exit.USAGE, "No such option"),
+        (["result", "JOB", "--fps", "50"], Exit.REFUSED, "--fps: expected --make beside it"),
         (["submit"], Exit.USAGE, "Missing argument"),
         (["frobnicate"], Exit.USAGE, "No such command"),
         (["list", "--url", "nowhere"], Exit.REFUSED, "Expected the address of a service"),
@@ -198,7 +258,7 @@ def test_the_token_comes_from_the_environment(tracks: Path, monkeypatch: pytest.
     session = Session(transport=service)
     ran = CliRunner().invoke(app, ["list"], obj=session)
     assert ran.exit_code == Exit.NOT_NOW
-    monkeypatch.setenv("PLIANT_TOKEN", service.create_token())
+    monkeypatch.setenv("PLIANT_TOKEN", f"{service.create_token()}\r\n")  # of a file with the line ends of Windows
     assert CliRunner().invoke(app, ["list"], obj=session).exit_code == 0
 
 

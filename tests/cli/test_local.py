@@ -305,6 +305,6 @@ def test_doctor_says_how_to_install_a_missing_server(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, "redis", None)
     findings = {finding.what: finding for finding in doctor.check_packages()}
     assert (findings["packages"].verdict, findings["server"].verdict) == ("good", "note")
-    assert "pip install 'pliant[server]'" in findings["server"].advice
+    assert "pip install '.[server]'" in findings["server"].advice
     monkeypatch.delenv("PLIANT_REDIS_URL", raising=False)
     assert list(doctor.check_valkey()) == []

@@ -337,7 +337,8 @@ def test_server_commands_say_what_to_install(
     name = {"token": "pliant token"}.get(command[0], f"pliant {' '.join(command)}")
     assert ran.exit_code == Exit.UNHEALTHY
     assert words(ran) == refusal(
-        f"{name} needs the service, which is not installed: pip install 'pliant[server]'", "missing_extra"
+        f"{name} needs the service, which is not installed: pip install '.[server]' in Pliant's source folder",
+        "missing_extra",
     )
 
 
@@ -373,7 +374,7 @@ def test_a_missing_server_module_says_what_to_install(run: Run, monkeypatch: pyt
     monkeypatch.setattr("pliant.client._sync.client.Client.list", broken)
     ran = run("list")
     assert ran.exit_code == Exit.UNHEALTHY
-    assert "pip install 'pliant[server]'" in words(ran)
+    assert "pip install '.[server]'" in words(ran)
 
 
 def interrupted(command: list[str], after: str, *, cwd: Path) -> tuple[int, str]:

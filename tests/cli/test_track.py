@@ -5,7 +5,9 @@ from __future__ import annotations
 import errno
 import importlib
 import json
+import os
 import re
+import sys
 from pathlib import Path
 from typing import IO
 
@@ -14,9 +16,10 @@ import numpy as np
 import pytest
 from PIL import Image
 from pliant.cli import app
+from pliant.cli.paths import written_aside
 from pliant.tracking import FilmError
 from pliant.tracking.records import TrackingStep
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 
 def test_a_film_becomes_tracks_and_a_preview(tmp_path: Path) -> None:
@@ -108,6 +111,68 @@ def test_a_file_of_the_command_is_not_replaced_by_another(tmp_path: Path) -> Non
         assert "is also another file of this command" in " ".join(ran.output.split())
     assert [each.name for each in tmp_path.iterdir()] == ["film.mkv"]
     assert film.read_bytes() == before
+
+
+def track(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["track", *map(str, arguments)], env={"COLUMNS": "400"})
+
+
+def not_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let tracking fail the test."""
+    monkeypatch.setattr("pliant.tracking.track_film", lambda *given, **options: pytest.fail("the film was tracked"))
+
+
+@pytest.mark.parametrize(
+    ("output", "preview", "expected"),
+    [
+        ("x.csv", "sheet.jpg", "--output: expected a name that ends in .npz"),
+        ("x", "sheet.jpg", "--output: expected a name that ends in .npz"),
+        ("x.npz", "sheet.png", "--preview: expected a name that ends in .jpg or .jpeg"),
+        ("x" * 252 + ".npz", "sheet.jpg", "File name too long"),
+    ],
+)
+def test_names_that_do_not_fit_the_files_are_refused_before_tracking(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, output: str, preview: str, expected: str
+) -> None:
+    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72)))
+    not_tracked(monkeypatch)
+    ran = track(film, "-o", tmp_path / output, "--preview", tmp_path / preview)
+    assert ran.exit_code == 3, ran.output
+    assert expected in " ".join(ran.output.split())
+    assert [each.name for each in tmp_path.iterdir()] == ["film.mkv"]
+
+
+def test_a_file_may_have_the_longest_name(tmp_path: Path) -> None:
+    with written_aside(tmp_path / ("x" * 251 + ".npz")) as aside:
+        aside.write_text("content")
+        assert aside.parent == tmp_path
+    assert [each.name for each in tmp_path.iterdir()] == ["x" * 251 + ".npz"]
+    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72)))
+    assert track(film, "-o", tmp_path / "A.NPZ", "--preview", tmp_path / "a.JPEG").exit_code == 0
+
+
+def test_a_preview_is_no_frame_of_the_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "film"
+    folder.mkdir()
+    for number, picture in enumerate(films.textured_pictures(4, (96, 72))):
+        (folder / f"{number}.png").write_bytes(films.png(picture))
+    with monkeypatch.context() as patch:
+        not_tracked(patch)
+        ran = track(folder, "-o", tmp_path / "x.npz", "--preview", folder / "." / "sheet.jpg")
+    assert ran.exit_code == 3, ran.output
+    assert "--preview: expected a file outside the film's folder" in " ".join(ran.output.split())
+    assert len(list(folder.iterdir())) == 4
+    assert track(folder, "-o", folder / "x.npz", "--preview", tmp_path / "sheet.jpg").exit_code == 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_a_name_that_is_no_utf_8_is_refused(tmp_path: Path) -> None:
+    film = Path(os.fsdecode(bytes(tmp_path) + b"/bad\xff.mkv"))
+    films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72))).rename(film)
+    for command in (["track", "-o", "x.npz"], ["solve", "-o", str(tmp_path / "out")], ["inspect"]):
+        ran = CliRunner().invoke(app, [command[0], str(film), *command[1:]], env={"COLUMNS": "400"})
+        assert ran.exit_code == 3, ran.output
+        assert "bad?.mkv. Rename the file or folder." in " ".join(ran.output.split())
 
 
 def test_earlier_tracks_survive_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -136,6 +136,13 @@ def test_options_that_do_not_fit_the_film_are_rejected(film: Path, region: Path,
     assert refusal(FilmSource(film), Options(frames="50:60")).code == "too_few_frames"
     assert refusal(FilmSource(film), bounds=FilmBounds(max_pixels=1000)).code == "too_many_pixels"
     assert refusal(FilmSource(film), bounds=FilmBounds(max_bytes=1000)).code == "too_many_bytes"
+    for name, value in (("region_frame", 1000), ("template_frame", 1000), ("grid_step", 1.0)):
+        wrong = refusal(FilmSource(film), Options(longest_side=64, **{name: value}))
+        assert wrong.field == f"options.{name}"
+        assert wrong.code == ("out_of_range" if name == "grid_step" else "no_such_frame")
+    assert refusal(FilmSource(film), Options(frames="2:8", template_frame=1)).field == "options.template_frame"
+    far = refusal(FilmSource(film, region), Options(frames="6:"), FilmBounds(max_frames=5))
+    assert (far.code, far.field) == ("too_many_frames", "options.region_frame")
     pictures = {f"{number}.png": films.png(each) for number, each in enumerate(films.textured_pictures(4))}
     many = films.zip_of(tmp_path / "many.zip", pictures)
     assert refusal(FilmSource(many), bounds=FilmBounds(max_frames=3)).code == "too_many_frames"
@@ -151,10 +158,12 @@ def test_too_little_memory_or_time_is_an_input_error(film: Path, tmp_path: Path)
 
 def test_a_film_of_many_cuts_has_a_short_warning(film: Path) -> None:
     rows = np.arange(3000)
-    found = Survey(rows, rows / 30, np.ones(3000), tuple(range(6, 3000, 6)), np.ones(2, np.float32), broken_tail=False)
+    found = Survey(
+        rows, rows / 30, np.ones(3000), (0, 3000), tuple(range(6, 3000, 6)), np.ones(2, np.float32), broken_tail=False
+    )
     warnings = tuple(warnings_before(open_film(film), found, 0, 6, whole=False, rough=1.0))
     assert "The film has 499 cuts (the first at frame 6). Only frames 0 to 5 are tracked." in warnings[0]
-    assert Tracked(container="matroska", warnings=warnings).warnings == warnings
+    assert Tracked(container="matroska", fps=30.0, warnings=warnings).warnings == warnings
 
 
 def test_each_exit_of_the_film_process_maps_to_an_error() -> None:
@@ -356,7 +365,7 @@ def tracks_file(path: Path, **more: np.ndarray) -> Path:
 def test_tracker_confidence_becomes_the_observation_weight(tmp_path: Path) -> None:
     seen = np.ones((4, 9), bool)
     seen[1, 3] = False
-    tracked = Tracked(container="mp4", warnings=("Only 4 frames.",))
+    tracked = Tracked(container="mp4", fps=30.0, warnings=("Only 4 frames.",))
     inputs = read_tracked(tracks_file(tmp_path / "a.npz", visibility=seen), tracked, Options())
     assert isinstance(inputs, Inputs)
     assert inputs.tracks.visible[1, 3] == 0

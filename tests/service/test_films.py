@@ -88,6 +88,18 @@ def test_a_film_becomes_a_job_with_tracks_and_shapes(running: Running, http: htt
 
 
 @forked
+def test_a_finished_job_has_the_rate_of_the_tracked_frames(
+    running: Running, http: httpx.Client, tmp_path: Path
+) -> None:
+    film = films.with_uneven_times(films.write_film(tmp_path / "film.mp4", PICTURES), first=3).read_bytes()
+    own, unset = send(http, film, options={**QUICK, "fps": 12}), send(http, film, options=QUICK)
+    assert work(running, own.id).options.fps == 12
+    job = work(running, unset.id)
+    with np.load(io.BytesIO(http.get(f"/v1/jobs/{job.id}/artifacts/tracks.npz").content)) as tracks:
+        assert job.options.fps == tracks["fps"] != unset.options.fps
+    assert job.interpretation.fps == job.options.fps
+
+
 def test_a_film_without_a_region_succeeds_with_a_warning(running: Running, http: httpx.Client, film: bytes) -> None:
     done = work(running, send(http, film, options=QUICK).id)
     assert done.status is Status.SUCCEEDED, done.error

@@ -84,7 +84,7 @@ def test_without_tracing_a_job_has_no_trace(running: Running, http: httpx.Client
 def test_missing_opentelemetry_names_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("opentelemetry.sdk.resources", "opentelemetry.sdk.trace", "opentelemetry.sdk.trace.export"):
         monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(InvalidSetting, match=r"pliant\[otel\]"):
+    with pytest.raises(InvalidSetting, match=r"\.\[otel\]"):
         tracing.configure("console", service="test")
     tracing.configure("off", service="test")
 

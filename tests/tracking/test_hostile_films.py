@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import sys
 import zipfile
 from pathlib import Path
 
@@ -60,6 +62,94 @@ def test_missing_and_empty_files_are_refused(tmp_path: Path) -> None:
 def test_file_names_are_not_interpreted_as_patterns_or_urls(tmp_path: Path, name: str) -> None:
     films.write_film(tmp_path / "plain.mp4", PICTURES).rename(tmp_path / name)
     assert len(list(open_film(tmp_path / name).frames())) == 12
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+@pytest.mark.parametrize("name", ["film.mp4", "film.gif", "pictures"])
+def test_a_path_that_is_no_utf_8_is_refused(tmp_path: Path, name: str) -> None:
+    """OpenCV would end the process."""
+    folder = Path(os.fsdecode(bytes(tmp_path) + b"/bad\xff"))
+    folder.mkdir()
+    films.write_film(tmp_path / "film.mp4", PICTURES).rename(folder / "film.mp4")
+    (folder / "film.gif").write_bytes(b"GIF89a")
+    (folder / "pictures").mkdir()
+    with pytest.raises(FilmError, match="Rename the file or folder") as caught:
+        open_film(folder / name)
+    assert caught.value.code == "unreadable_film"
+    assert caught.value.got.encode().endswith(f"bad?/{name}".encode())
+
+
+def test_pipes_and_devices_are_refused_without_waiting(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "film.mp4")
+    for path in (tmp_path / "film.mp4", Path("/dev/zero")):
+        with pytest.raises(FilmError, match="a pipe or a device") as caught:
+            open_film(path)
+        assert caught.value.code == "unreadable_film"
+
+
+@pytest.mark.parametrize("name", ["x" * 300 + ".mp4", "a\0b.mp4", "film.mp4/below"])
+def test_names_that_the_system_does_not_allow_are_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "film.mp4").write_bytes(b"")
+    assert refused(tmp_path / name) == "unreadable_film"
+
+
+def test_a_film_that_may_not_be_looked_at_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = films.write_film(tmp_path / "film.mp4", PICTURES)
+
+    def locked(self: Path, **options: object) -> os.stat_result:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "stat", locked)
+    assert refused(path) == "unreadable_film"
+
+
+@pytest.mark.parametrize("matrix", [(-1, 0, 0, 1), (1, 0, 0, -1), (0, 1, 1, 0), (0, -1, -1, 0)])
+@pytest.mark.parametrize(("kind", "place"), [(b"tkhd", 44), (b"mvhd", 40)])
+def test_mirrored_films_are_refused(tmp_path: Path, kind: bytes, place: int, matrix: tuple[int, ...]) -> None:
+    a, b, c, d = (number << 16 for number in matrix)
+    path = films.write_film(tmp_path / "film.mp4", PICTURES)
+    films.patched(path, kind, place, struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30))
+    with pytest.raises(FilmError, match=r"to be shown mirrored\. Convert it") as caught:
+        open_film(path)
+    assert caught.value.code == "unsupported_film"
+
+
+def test_the_matrix_of_a_long_header_is_read(tmp_path: Path) -> None:
+    def film(*matrix: int) -> Path:
+        a, b, c, d = (number << 16 for number in matrix)
+        header = b"\1" + bytes(51) + struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+        path = tmp_path / "film.mp4"
+        path.write_bytes(FTYP + films.box(b"moov", films.box(b"trak", films.box(b"tkhd", header + bytes(8)))))
+        return path
+
+    assert refused(film(-1, 0, 0, 1)) == "unsupported_film"
+    assert refused(film(0, 1, -1, 0)) == "no_picture"
+
+
+@pytest.mark.parametrize("brand", [b"heic", b"mif1", b"avif"])
+def test_a_photograph_is_no_film_that_was_cut_off(tmp_path: Path, brand: bytes) -> None:
+    path = tmp_path / "photo.heic"
+    path.write_bytes(
+        films.box(b"ftyp", brand, b"\0\0\0\0", b"mif1") + films.box(b"meta", bytes(4)) + films.box(b"mdat")
+    )
+    with pytest.raises(FilmError, match="a single photograph") as caught:
+        open_film(path)
+    assert caught.value.code == "unsupported_film"
+
+
+def test_a_picture_of_an_unknown_format_is_named_without_its_address(tmp_path: Path) -> None:
+    path = films.zip_of(tmp_path / "film.zip", {"1.png": b"no picture"})
+    with pytest.raises(FilmError) as caught:
+        open_film(path)
+    assert caught.value.got == "1.png: its format is not recognised"
+
+
+@pytest.mark.parametrize("frames", [slice("a", None), slice(1.5, 9), slice(0, 9, 2.0), 5.0, [3]])
+def test_selections_of_other_types_are_refused(tmp_path: Path, frames: object) -> None:
+    path = films.write_film(tmp_path / "film.avi", PICTURES)
+    with pytest.raises(FilmError) as caught:
+        open_film(path, frames=frames)  # type: ignore[arg-type]
+    assert (caught.value.code, caught.value.field) == ("wrong_selection", "frames")
 
 
 def test_samples_in_another_file_are_refused(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ def test_importing_without_opencv_names_the_extra_to_install() -> None:
     code = "import sys; sys.modules['cv2'] = None\nimport pliant.tracking"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert ran.returncode != 0
-    assert "pip install 'pliant[film]'" in ran.stderr
+    assert "pip install '.[film]'" in ran.stderr
 
 
 def test_pliant_and_its_solver_do_not_import_opencv() -> None:

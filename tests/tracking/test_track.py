@@ -344,7 +344,15 @@ def test_tracks_of_reduced_films_are_in_the_original_pixels(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("grid_step", 0.0), ("grid_step", 1000.0), ("longest_side", 10), ("threads", 0)]
+    ("option", "value"),
+    [
+        ("grid_step", 0.0),
+        ("grid_step", 1000.0),
+        ("grid_step", "4"),
+        ("longest_side", 10),
+        ("threads", 0),
+        ("threads", 1.5),
+    ],
 )
 def test_options_out_of_range_are_refused(option: str, value: float) -> None:
     with pytest.raises(FilmError) as caught:
@@ -356,8 +364,56 @@ def test_options_out_of_range_are_refused(option: str, value: float) -> None:
 @pytest.mark.parametrize("frame", [-1, 16])
 def test_frames_outside_the_film_are_refused(turning: tuple[Path, RenderedFilm], field: str, frame: int) -> None:
     with pytest.raises(FilmError) as caught:
-        track_film(turning[0], **{field: frame})  # type: ignore[arg-type]
+        track_film(turning[0], region=turning[1].region(0), **{field: frame})  # type: ignore[arg-type]
     assert (caught.value.code, caught.value.field) == ("no_such_frame", field)
+
+
+def test_points_closer_than_the_pixels_of_the_trackers_frames_are_refused(tmp_path: Path) -> None:
+    pictures = [cv2.resize(p, (768, 576), interpolation=cv2.INTER_CUBIC) for p in films.textured_pictures(3, (96, 72))]
+    path = films.write_film(tmp_path / "film.mkv", pictures)
+    with pytest.raises(FilmError) as caught:
+        track_film(path, grid_step=3.9, longest_side=192)
+    assert (caught.value.code, caught.value.field) == ("out_of_range", "grid_step")
+    assert "expected at least 4 pixels, one of the tracker's frames, got 3.9" in str(caught.value)
+    region = [(200, 150), (300, 150), (300, 250), (200, 250)]
+    assert track_film(path, region=region, grid_step=4, longest_side=192).tracks.shape[1] > 300
+
+
+def test_a_grid_too_wide_for_the_region_is_named_as_such(tmp_path: Path) -> None:
+    path = films.write_film(tmp_path / "film.mkv", films.textured_pictures(3, (320, 240)))
+    with pytest.raises(FilmError) as caught:
+        track_film(path, region=[(60, 60), (80, 60), (80, 80), (60, 80)], grid_step=100)
+    assert (caught.value.code, caught.value.got) == ("no_texture", "0 (no point of the grid lies in the region)")
+
+
+@pytest.mark.parametrize(("size", "shape"), [((16, 1720), (960, 320)), ((1720, 16), (80, 320))])
+def test_very_long_films_have_a_contact_sheet(tmp_path: Path, size: tuple[int, int], shape: tuple[int, int]) -> None:
+    tracked = track_film(films.write_film(tmp_path / "film.avi", films.textured_pictures(4, size)))
+    assert tracked.thumbnails.shape == (4, *shape, 3)
+    picture = cv2.imdecode(np.frombuffer(tracked.contact_sheet(), np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape == (2 * shape[0], 3 * shape[1], 3)
+
+
+def test_points_outside_the_picture_are_hidden(tmp_path: Path) -> None:
+    """The texture moves out to the right; in the second pass, repeated pixels of the border look like what has left."""
+    path = films.write_film(tmp_path / "film.mkv", films.textured_pictures(16, (160, 120), step=4))
+    tracked = track_film(path, region=[(60, 20), (154, 20), (154, 100), (60, 100)])
+    right, bottom = 159 + 0.5, 119 + 0.5
+    outside = ((tracked.tracks < -0.5) | (tracked.tracks > (right, bottom))).any(axis=2)
+    assert outside.mean() > 0.1
+    assert not (outside & tracked.visibility).any()
+    true = tracked.tracks[0, :, 0] + 4 * np.arange(16)[:, None]
+    assert tracked.visibility[(true <= 159) & (true >= 0)].mean() > 0.97
+    assert tracked.visibility[true > 160].mean() < 0.01
+
+
+def test_frames_of_a_carried_region_are_counted_to_the_last(turning: tuple[Path, RenderedFilm]) -> None:
+    path, film = turning
+    steps: list[TrackingStep] = []
+    track_film(path, region=film.region(0), template_frame=9, grid_step=6, on_step=steps.append)
+    located = [step for step in steps if step.stage == "locate"]
+    assert [step.done for step in located] == [2, 4, 6, 8, 9]
+    assert {step.total for step in located} == {9}
 
 
 def test_a_portrait_film_is_tracked_upright(tmp_path: Path) -> None:

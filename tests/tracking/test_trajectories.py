@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pliant.tracking.appearance import Appearance, noise_variance
 from pliant.tracking.chaining import Chain
-from pliant.tracking.errors import TrackingStopped
+from pliant.tracking.errors import FilmError, TrackingStopped
 from pliant.tracking.registration import Registration
 from pliant.tracking.seeding import neighbours, place
 from pliant.tracking.trajectories import move_to_expected, track_again
@@ -44,6 +44,21 @@ def test_computing_expected_positions_can_be_stopped() -> None:
     chained = Chain(points, np.ones((FRAMES, 60), bool), np.full((FRAMES, 60), 0.01, np.float32))
     with pytest.raises(TrackingStopped):
         move_to_expected(chained, lambda: True)
+
+
+@pytest.mark.parametrize("seen", [1, 3])
+def test_too_few_points_beyond_the_template_are_lost_tracks(seen: int) -> None:
+    points = turning(np.random.default_rng(0).uniform(20, 140, (60, 2)).astype(np.float32))
+    visible = np.zeros((FRAMES, 60), bool)
+    visible[0] = True
+    visible[1:3, :seen] = True
+    with pytest.raises(FilmError) as caught:
+        move_to_expected(Chain(points, visible, np.full((FRAMES, 60), 0.01, np.float32)), bool)
+    assert str(caught.value) == (
+        f"film: expected at least 4 points that stay visible beyond the template, got {seen}. Film more slowly and with more light, so "
+        "that successive frames overlap and are not blurred."
+    )
+    assert caught.value.code == "tracks_lost"
 
 
 def test_memory_for_expected_positions_is_proportional_to_the_tracks() -> None:

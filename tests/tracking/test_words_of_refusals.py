@@ -152,7 +152,7 @@ CASES: dict[str, Case] = {
     "a region that is no mask": Case(data=film, given={"region": np.ones((2, 3, 4, 5))}, track=True,
         words="region: expected a mask (H, W) of bool or uint8, or a polygon (N, 2) with N ≥ 3, got shape (2, 3, 4, 5), dtype float64. Convert the array."),
     "a polygon of two corners": Case(data=film, given={"region": np.ones((2, 2))}, track=True,
-        words="region: expected a polygon of at least 3 corners with finite pixel coordinates, got 2 corners. Draw around the object to track."),
+        words="region: expected a polygon of at least 3 corners with finite pixel coordinates up to 1,000,000, got 2 corners. Draw around the object to track."),
     "a region that is no picture": Case(data=film, given={"region": __file__}, track=True,
         words="region: expected a PNG, JPEG, WebP, BMP or GIF picture, got test_words_of_refusals.py: …. Save the mask as PNG: white inside, black outside."),
 }  # fmt: skip

@@ -7,6 +7,7 @@ Only the binary containers below are accepted, and QuickTime files only if their
 from __future__ import annotations
 
 import os
+import stat
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,6 +31,12 @@ ARRAYS = (b"\x93NUMPY", b"\x89HDF", b"MATLAB 5.0")
 """First bytes of npy, HDF5 (MATLAB 7.3, SLEAP, DeepLabCut) and MATLAB 5 files, which hold tracks."""
 TABLES = (".csv", ".tsv", ".json")
 """Names of text files that hold tracks."""
+PHOTOS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"avif")
+"""Brands of single pictures in the boxes of an MP4 file (ISO/IEC 23008-12, and AVIF)."""
+MATRICES = {b"tkhd": 40, b"mvhd": 36}
+"""Boxes with a display matrix, and its place in their content, bytes; 12 bytes later in version 1."""
+READ = {b"hdlr", b"dref", *MATRICES}
+"""Boxes whose content is read."""
 TEXTS = (b"#EXT", b"ffconcat", b"v=0", b"<?xml", b"<MPD", b"[playlist]", b"http", b"rtsp", b"file:")
 
 
@@ -39,12 +46,42 @@ def recognise(path: Path) -> Container:
     Raises
     ------
     FilmError
-        It does not exist, is empty, is a playlist, refers to other files, holds no picture, or is none of the accepted kinds.
+        It does not exist, is no file or folder, cannot be read, is empty, is a playlist, refers to other files, holds no picture, is
+        mirrored, or is none of the accepted kinds; or its path is not valid UTF-8, which OpenCV needs.
     """
-    if path.is_dir():
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        got = str(path).encode(errors="replace").decode()
+        raise FilmError(
+            "unreadable_film", field="film", expected="a path of valid UTF-8", got=got, hint="Rename the file or folder.",
+        ) from None  # fmt: skip
+    if _file_or_folder(path) == "folder":
         return "folder"
     with openable(path), path.open("rb") as stream:
         return _recognise_stream(stream, path.name)
+
+
+def _file_or_folder(path: Path) -> Literal["file", "folder"]:
+    """Return whether a path is a file or a folder.
+
+    Raises
+    ------
+    FilmError
+        Neither: opening a pipe or a device may wait forever. Or it does not exist, or the system does not let it be looked at.
+    """
+    with openable(path):
+        try:
+            mode = path.stat().st_mode
+        except ValueError as error:  # a NUL in the name
+            raise _refusal("unreadable_film", f"{path.name!r}: {error}", "Check the path.") from error
+    if stat.S_ISDIR(mode):
+        return "folder"
+    if not stat.S_ISREG(mode):
+        raise _refusal(
+            "unreadable_film", f"{path.name}, a pipe or a device", "Save the film in a file and pass its path."
+        )
+    return "file"
 
 
 @contextmanager
@@ -60,6 +97,8 @@ def _recognise_stream(stream: BinaryIO, name: str) -> Container:
     head = stream.read(4096)
     if not head:
         raise _refusal("empty_film", f"{name}, which is empty", "Copy the film again.")
+    if head[4:8] == b"ftyp" and head[8:12] in PHOTOS:
+        raise _refusal("unsupported_film", f"{name}, a single photograph (HEIF or AVIF)", "Pass a film of the object.")
     if head[4:8] in MP4_BOXES:
         _check_mp4(stream, name)
         return "mp4"
@@ -97,7 +136,7 @@ def _holds_arrays(head: bytes, name: str) -> bool:
 
 
 def _check_mp4(stream: BinaryIO, name: str) -> None:
-    """Check the boxes of an MP4 or QuickTime file: it needs an index and a picture track, and all samples in the same file."""
+    """Check the boxes of an MP4 or QuickTime file: an index, a picture track that is not mirrored, and all samples in the same file."""
     end = os.fstat(stream.fileno()).st_size
     kinds: list[bytes] = []
     streams = 0
@@ -116,6 +155,10 @@ def _check_mp4(stream: BinaryIO, name: str) -> None:
             )
         if kind == b"hdlr":
             kinds.append(b"hdlr:" + body[8:12])
+        if kind in MATRICES and _mirrors(body, MATRICES[kind]):
+            raise _refusal(
+                "unsupported_film", f"{name}, which is to be shown mirrored", "Convert it: ffmpeg -i FILM film.mp4"
+            )
         if kind == b"dref" and not _self_contained(body):
             raise _refusal(
                 "external_reference", f"{name}, whose samples lie in another file",
@@ -135,7 +178,7 @@ def _check_mp4(stream: BinaryIO, name: str) -> None:
 
 
 def _boxes(stream: BinaryIO, end: int) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the type of all boxes, descending into those of `NESTED`, with the first bytes of `hdlr` and `dref` boxes."""
+    """Yield the type of all boxes, descending into those of `NESTED`, with the first bytes of those of `READ`."""
     pending = [(0, end)]
     while pending:
         place, stop = pending.pop()
@@ -153,10 +196,23 @@ def _boxes(stream: BinaryIO, end: int) -> Iterator[tuple[bytes, bytes]]:
                 break
             following = min(place + size, stop)
             stream.seek(inner)
-            yield kind, stream.read(min(4096, following - inner)) if kind in (b"hdlr", b"dref") else b""
+            yield kind, stream.read(min(4096, following - inner)) if kind in READ else b""
             if kind in NESTED:
                 pending.append((inner, following))
             place = following
+
+
+def _mirrors(body: bytes, place: int) -> bool:
+    """Return whether the display matrix at a place of a box's content, given for version 0, mirrors the picture.
+
+    The first two rows are a, b, u, c, d, v: a pixel (p, q) is shown at (a p + c q, b p + d q) (ISO/IEC 14496-12, 6.2.2). OpenCV applies
+    the rotation only.
+    """
+    place += 12 if body[:1] == b"\1" else 0
+    if len(body) < place + 24:
+        return False
+    a, b, _, c, d, _ = struct.unpack_from(">6i", body, place)
+    return bool(a * d - b * c < 0)
 
 
 def _self_contained(body: bytes) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import operator
 import os
 import threading
 from collections.abc import Generator, Iterator
@@ -14,7 +15,7 @@ from typing import TypedDict
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pliant.tracking.decoding.containers import Container, recognise
+from pliant.tracking.decoding.containers import Container, openable, recognise
 from pliant.tracking.decoding.limits import FilmLimits
 from pliant.tracking.decoding.pictures import checked, folder_pictures, gif_frames, read_picture, zip_pictures
 from pliant.tracking.errors import FilmError
@@ -113,6 +114,29 @@ class Film:
                 self._check(frame, used)
                 yield frame
 
+    def reaching(self, frame: int) -> Film:
+        """Return the film with its selection continued, in its own steps, to the region's frame before or after it.
+
+        The limit on the number of frames applies to each of the two parts.
+
+        Raises
+        ------
+        FilmError
+            The frame is too far away.
+        """
+        start, stop, step = self.selection
+        before = max(0, start - frame) // step
+        after = 0 if stop is None else -(-max(0, frame + 1 - stop) // step)
+        if before + after > self.limits.frames:
+            raise FilmError(
+                "too_many_frames", field="region_frame", expected=f"at most {self.limits.frames} frames from there to those used",
+                got=str(before + after), hint="Draw the region on one of the frames used, and give its number.",
+            )  # fmt: skip
+        selection = start - before * step, stop if stop is None else max(stop, frame + 1), step
+        return replace(
+            self, selection=selection, limits=replace(self.limits, frames=self.limits.frames + before + after)
+        )
+
     def _check(self, frame: Frame, used: int) -> None:
         if used > self.limits.frames:
             raise FilmError(
@@ -174,10 +198,12 @@ def open_film(path: Path | str, *, frames: int | slice | str | None = None, limi
     """
     source, limits = Path(path).absolute(), limits or FilmLimits()
     container = recognise(source)
-    if container != "folder" and source.stat().st_size > limits.bytes:
+    with openable(source):
+        size = 0 if container == "folder" else source.stat().st_size
+    if size > limits.bytes:
         raise FilmError(
             "too_many_bytes", field="film", expected=f"at most {limits.bytes:,} bytes",
-            got=f"{source.name} of {source.stat().st_size:,}", hint="Cut the film, or compress it more.",
+            got=f"{source.name} of {size:,}", hint="Cut the film, or compress it more.",
         )  # fmt: skip
     facts = _facts(source, container, limits)
     film = Film(source, container, **facts, selection=(0, None, 1), limits=limits)
@@ -271,12 +297,13 @@ def _selection(film: Film, frames: int | slice | str | None) -> tuple[int, int |
             parts = [int(part) if part.strip() else None for part in frames.split(":")]
             frames = slice(*parts) if len(parts) in (2, 3) else parts[0] if len(parts) == 1 else None
         if isinstance(frames, slice):
-            start, stop, step = frames.start or 0, frames.stop, 1 if frames.step is None else frames.step
+            start, step = operator.index(frames.start or 0), 1 if frames.step is None else operator.index(frames.step)
+            stop = None if frames.stop is None else operator.index(frames.stop)
             if start >= 0 and step >= 1 and (stop is None or stop > start):
-                return int(start), None if stop is None else int(stop), int(step)
-        elif isinstance(frames, int) and not isinstance(frames, bool) and frames >= 1:
-            return 0, None, max(1, -(-_count(film) // frames))
-    except ValueError:
+                return start, stop, step
+        elif not isinstance(frames, bool) and (most := operator.index(frames)) >= 1:  # type: ignore[arg-type]
+            return 0, None, max(1, -(-_count(film) // most))
+    except (TypeError, ValueError):
         pass
     raise FilmError(
         "wrong_selection", field="frames",

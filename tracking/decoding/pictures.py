@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, UnidentifiedImageError
 from pliant.tracking.decoding.containers import openable
 from pliant.tracking.decoding.limits import FilmLimits
 from pliant.tracking.errors import FilmError
@@ -47,8 +47,9 @@ def readable(name: str) -> Iterator[None]:
     except Exception as error:  # the decompressors' errors have no common class, and not every Python has all of them
         if str(error).startswith(NO_MEMORY):
             raise MemoryError(str(error)) from error
+        fault = "its format is not recognised" if isinstance(error, UnidentifiedImageError) else error
         raise FilmError(
-            "broken_picture", field="film", expected="pictures that can be decoded", got=f"{name}: {error}",
+            "broken_picture", field="film", expected="pictures that can be decoded", got=f"{name}: {fault}",
             hint="Save it again as PNG or JPEG.",
         ) from error  # fmt: skip
 
@@ -69,10 +70,15 @@ def read_picture(data: bytes | Path, name: str, limits: FilmLimits) -> Colour:
     """
     with readable(name), Image.open(io.BytesIO(data) if isinstance(data, bytes) else data, formats=FORMATS) as picture:
         checked(picture.size, name, limits)
-        upright = ImageOps.exif_transpose(picture)
-        if upright.mode.startswith("I"):  # 16 bits of grey, which Pillow would clip to 8 bits instead of scaling them
-            upright = Image.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
-        return np.asarray(upright.convert("RGB"))
+        return np.asarray(upright(picture).convert("RGB"))
+
+
+def upright(picture: Image.Image) -> Image.Image:
+    """Decode a picture, turned by its EXIF orientation; grey levels of 16 bits are reduced to 8, where Pillow would clip them."""
+    turned = ImageOps.exif_transpose(picture)
+    if turned.mode.startswith("I"):
+        return Image.fromarray((np.asarray(turned) >> 8).astype(np.uint8))
+    return turned
 
 
 def checked(size: tuple[int, int], name: str, limits: FilmLimits) -> tuple[int, int]:

@@ -130,9 +130,12 @@ class RenderedFilm:
 
         Returns
         -------
-        tracks, visible, shapes
-            True pixels `(F, N, 2)`, visibility `(F, N)`, and points in space `(F, N, 3)`. Tracks of points that are
-            not on the object are NaN.
+        tracks : array, shape (F, N, 2)
+            True pixels, NaN for points that are not on the object.
+        visible : array, shape (F, N)
+            Whether the object shows the point.
+        shapes : array, shape (F, N, 3)
+            Points in space.
         """
         corner, weights = self._hit(points, index)
         shapes = np.einsum("nk,fnkc->fnc", weights, self.shapes[:, corner])
@@ -256,8 +259,16 @@ def render_film(
         Share of the image's width or height that the object spans at most.
     distance
         From the camera to the object's centre, in half heights of the object.
-    blur, noise, paint, occluder, seed
-        See `RenderedFilm`; `paint.face_paint` colours the gallery's face.
+    blur
+        Standard deviation of the lens blur in pixels.
+    noise
+        Standard deviation of the noise in grey levels (0–255).
+    paint
+        Colour of every vertex, shape `(P, 3)`, grey levels; `paint.face_paint` colours the gallery's face. None: the texture alone.
+    occluder
+        Whether a textured bar passes in front of the object once.
+    seed
+        Seed of texture, background and noise.
     """
     turned = sequence.shapes @ sequence.rotations.transpose(0, 2, 1)
     radius = np.abs(turned[..., 1]).max()

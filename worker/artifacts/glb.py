@@ -256,7 +256,10 @@ def _in_bytes(normals: Singles) -> NDArray[np.int8]:
 def _rounded(
     animation: Animation, node: dict[str, Any], *, quantized: bool
 ) -> tuple[Array, Callable[[int], Array], dict[str, Any]]:
-    """Return positions, displacements and node; if `quantized`, 16-bit fractions of one size, which the node's scale restores."""
+    """Return positions, displacements and node; if `quantized`, 16-bit fractions of one size, which the node's scale restores.
+
+    The bound of their rounding error is added to the animation's `max_error`.
+    """
     if not quantized:
         return animation.base, animation.target, node
     low, high = animation.base.min(axis=0), animation.base.max(axis=0)
@@ -268,6 +271,8 @@ def _rounded(
         return np.asarray(np.rint(animation.target(index) / size * 32767).astype(np.int16))
 
     positions = np.rint((animation.base - centre) / size * 32767).astype(np.int16)
+    half_step = size / 32767 / 2  # of the base and of each target
+    animation.extras["max_error"] += half_step * (1 + float(np.abs(animation.weights).sum(axis=1).max()))
     scale = float(node.get("scale", [1.0])[0])
     placed = {**node, "scale": [scale * size] * 3, "translation": (scale * centre).tolist()}
     return positions, target, placed

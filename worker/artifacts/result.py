@@ -63,7 +63,7 @@ class Result:
             share = 100 * self.solution.shapes_std / size_of(self.solution.shapes)
             return Painting.of("expected error", share, seen, unit="percent of the object's size")
         if self.distances is not None:
-            return Painting.of("distance from the truth", self.distances)
+            return Painting.of("distance from the truth", self.distances, unit="the ground truth's unit")
         return Painting.of("reprojection residual", self.solution.residuals, seen)
 
     @property

@@ -27,6 +27,8 @@ def write_artifacts(
 ) -> list[Artifact]:  # fmt: skip
     """Write the result files that a job's options request into an existing directory; return them in the order written.
 
+    The report of an earlier result in the directory is removed first.
+
     The report is written last, with `artifacts` and `seconds.exporting` added; its `artifacts` may list files written earlier. `name` is
     the job's, from which the objects in the files are named. `on_progress` gets the completed share, in [0, 1].
 
@@ -39,6 +41,7 @@ def write_artifacts(
     result = Result(inputs, solution, options, name)
     report_share: OnProgress = on_progress or (lambda _: None)
     kinds = kinds_for(options, textured=result.texture is not None)
+    (directory / "report.json").unlink(missing_ok=True)  # after an error, it must not describe files of another result
     written, entries = write_kinds(result, kinds, directory, on_progress=report_share)
     seconds = {**report.get("seconds", {}), "exporting": time.perf_counter() - began}
     listed = {**report.get("artifacts", {}), **entries}

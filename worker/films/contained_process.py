@@ -60,7 +60,7 @@ def _answer(request: dict[str, Any]) -> str:
     except ImportError as error:
         raise InvalidInput(
             "film_unavailable", field="film", expected="tracks, or a service with OpenCV", got="a film",
-            hint="Install OpenCV beside service and worker (pip install 'pliant[film]'), or send tracks.",
+            hint="Install the extra film beside service and worker (pip install '.[film]' in Pliant's source folder), or send tracks.",
         ) from error  # fmt: skip
     if request["action"] == "track" or request["estimate"]:
         import_module("pliant.tracking.track")  # before the memory limit, which is meant for the film
@@ -86,9 +86,10 @@ def _answer(request: dict[str, Any]) -> str:
 
 
 def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
-    """Open the film, decode its first frame, and read the region."""
+    """Open the film, decode its first frame, read the region, and check the options against both."""
     from pliant.tracking import FilmError, open_film
     from pliant.tracking.decoding.film import LEAST_FRAMES
+    from pliant.tracking.planning.options import check_against
     from pliant.tracking.region import read_region
 
     options = request["options"]
@@ -105,6 +106,10 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
     region = _region(request)
     if region is not None:
         read_region(region, film.size)
+    check_against(
+        film, region=region is not None, region_frame=options["region_frame"], template_frame=options["template_frame"],
+        grid_step=options["grid_step"], longest_side=options["longest_side"],
+    )  # fmt: skip
     facts: dict[str, Any] = {
         "container": film.container, "width": film.size[0], "height": film.size[1], "fps": film.fps / step,
         "stated_frames": film.stated_frames, "frames": count or 0, "seconds": film.stated_frames / film.fps,
@@ -151,7 +156,7 @@ def _track(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
     tracked.save_npz(folder / "tracks.npz")
     (folder / "contact_sheet.jpg").write_bytes(tracked.contact_sheet())
     write_frames(film, tracked.film.frame_indices, folder / frame_strip.NAME)
-    return {"container": tracked.film.container, "warnings": list(tracked.warnings)}
+    return {"container": tracked.film.container, "fps": tracked.fps, "warnings": list(tracked.warnings)}
 
 
 _ACTIONS: dict[str, Callable[[dict[str, Any], FilmBounds], dict[str, Any]]] = {"check": _check, "track": _track}

@@ -47,8 +47,8 @@ def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
     stated = Interpretation(
         num_frames=checked.num_frames, num_points=checked.num_points, num_faces=0 if mesh is None else len(mesh.faces),
         hidden_fraction=hidden, mesh_source="film", has_ground_truth=False, has_rotations=False, layout="tracks (F, P, 2)",
-        format=f"film ({tracked.container})", given_points=given, num_left_out=len(left_out),
-        left_out_points=left_out[:1000].tolist(), notes=[*notes, *how, *sparse, *tracked.warnings],
+        format=f"film ({tracked.container})", image_size=options.image_size, fps=tracked.fps, given_points=given,
+        num_left_out=len(left_out), left_out_points=left_out[:1000].tolist(), notes=[*notes, *how, *sparse, *tracked.warnings],
     )  # fmt: skip
     frames = np.arange(checked.num_frames)
     selection = Selection(frames, kept, (len(frames), given))

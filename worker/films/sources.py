@@ -36,6 +36,9 @@ class FilmSource:
     region_name: str = ""
     """The same for the mask picture."""
 
+    own_rate: bool = False
+    """Whether the job sets the frame rate (`fps`) itself; otherwise it is that of the tracked frames."""
+
     @property
     def names(self) -> dict[str, str]:
         """Name of each file in messages."""
@@ -77,6 +80,7 @@ def save_source(source: FilmSource, interpretation: Interpretation, target: Path
         "film": source.film.suffix.lower(),
         "region": None if source.region is None else source.region.suffix.lower(),
         "names": source.names,
+        "own_rate": source.own_rate,
         "interpretation": interpretation.model_dump(mode="json"),
     }
     with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED) as archive:
@@ -115,6 +119,7 @@ def open_source(path: Path, folder: Path) -> FilmSource:
             return FilmSource(
                 film, None if region is None else _unpacked(archive, _REGION, folder / f"region{region}"),
                 film_name=str(names.get("film", "")), region_name=str(names.get("region", "")),
+                own_rate=bool(stated.get("own_rate", True)),  # earlier versions took the rate that the file states
             )  # fmt: skip
     except (zipfile.BadZipFile, KeyError, ValueError, TypeError, AttributeError) as error:
         raise damaged("inputs", "a stored film that cannot be read back") from error

@@ -69,6 +69,9 @@ class Tracked(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     container: Words
+    fps: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
+    """Frames per second, by the times of the frames used."""
+
     warnings: Annotated[tuple[Words, ...], Field(max_length=100)]
 
 
@@ -169,7 +172,10 @@ def described(facts: FilmFacts, options: Options) -> Interpretation:
 
 
 def film_options(options: Options, facts: FilmFacts) -> Options:
-    """Return the options with the film's image size, and with its frame rate unless the job sets one."""
+    """Return the options with the film's image size, and with its frame rate unless the job sets one.
+
+    Until the film is tracked this is the rate that its file states; see `FilmSource.own_rate`.
+    """
     known: dict[str, Any] = {"image_size": f"{facts.width}x{facts.height}"}
     if "fps" not in options.model_fields_set:
         known["fps"] = facts.fps

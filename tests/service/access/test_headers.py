@@ -97,6 +97,9 @@ def test_probes_and_monitoring_may_use_the_address_of_a_process(serve: Serve, pa
     running = serve(allowed_hosts=("pliant.example",))
     assert httpx.get(f"{running.url}{path}", headers={"Host": "10.42.0.17:8000"}).status_code != 421
     assert httpx.get(f"{running.url}{path}/", headers={"Host": "10.42.0.17:8000"}).status_code == 421
+    declared = httpx.get(f"{running.url}/openapi.json", headers={"Host": "pliant.example"}).json()["paths"]
+    assert "421" not in declared[path]["get"]["responses"]
+    assert "421" in declared["/v1/limits"]["get"]["responses"]
 
 
 def test_any_host_is_accepted_off_loopback_without_a_host_list(serve: Serve) -> None:

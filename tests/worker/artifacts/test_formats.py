@@ -265,6 +265,12 @@ def test_only_files_with_colours_have_a_legend(tmp_path: Path) -> None:
     files = write(tmp_path, make_result(outputs="ply,mdd", colours="error"))
     assert "colours" in description(files, "shapes_ply.zip")
     assert "colours" not in description(files, "shapes.mdd")
+    assert description(files, "shapes_ply.zip")["colours"]["unit"] == "the tracks' unit"
+
+
+def test_the_legend_of_the_distance_from_the_truth_has_its_unit(tmp_path: Path) -> None:
+    files = write(tmp_path, make_result(outputs="ply", colours="error", truth=True))
+    assert description(files, "shapes_ply.zip")["colours"]["unit"] == "the ground truth's unit"
 
 
 def test_mean_colours_use_only_visible_observations() -> None:

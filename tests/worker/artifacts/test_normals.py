@@ -71,6 +71,36 @@ def written(path: Path, *, quantized: bool) -> tuple[np.ndarray, pygltflib.GLTF2
 
 
 @pytest.mark.node
+@pytest.mark.parametrize("motion", ["auto", "frames"])
+@pytest.mark.parametrize("quantized", [False, True])
+def test_no_position_is_further_off_than_the_stated_error(tmp_path: Path, motion: str, quantized: bool) -> None:
+    shapes, triangles = rippled()
+    animation = animate(shapes, motion=motion)
+    with (tmp_path / "x.glb").open("wb") as file:
+        write_glb(file, animation, triangles, fps=10, node={}, quantized=quantized)
+    gltf = pygltflib.GLTF2.load_binary(tmp_path / "x.glb")
+
+    def positions(accessor: int) -> np.ndarray:
+        described = gltf.accessors[accessor]
+        view = gltf.bufferViews[described.bufferView]
+        number = np.dtype(np.int16 if quantized else np.float32)
+        stride = view.byteStride or 3 * number.itemsize
+        start = (view.byteOffset or 0) + (described.byteOffset or 0)
+        rows = np.frombuffer(gltf.binary_blob(), np.uint8, described.count * stride, start).reshape(-1, stride)
+        found = rows[:, : 3 * number.itemsize].copy().view(number).astype(float)
+        return found / 32767 if quantized else found
+
+    primitive, node = gltf.meshes[0].primitives[0], gltf.nodes[0]
+    targets = np.stack([positions(each["POSITION"]) for each in primitive.targets])
+    seen = positions(primitive.attributes.POSITION) + np.tensordot(animation.weights, targets, axes=1)
+    seen = seen * np.array(node.scale or [1, 1, 1]) + np.array(node.translation or [0, 0, 0])
+    exact = np.stack([animation.frame(index) for index in range(len(shapes))])
+    worst, stated = np.abs(seen - exact).max(), gltf.meshes[0].extras["pliant"]["max_error"]
+    assert worst <= stated + 1e-7
+    if quantized and motion == "frames":
+        assert stated < 3 * worst
+
+
 @pytest.mark.parametrize("quantized", [False, True])
 def test_targets_without_normals_share_one_accessor_without_data(tmp_path: Path, quantized: bool) -> None:
     _, gltf = written(tmp_path / "x.glb", quantized=quantized)

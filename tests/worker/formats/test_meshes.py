@@ -90,6 +90,14 @@ def test_negative_obj_indices_count_from_the_end(tmp_path: Path, tracks: Path) -
     np.testing.assert_array_equal(got.mesh.faces, [[P - 3, P - 2, P - 1], [0, 1, 2]])
 
 
+def test_obj_files_may_have_a_byte_order_mark_comments_and_continued_lines(tmp_path: Path, tracks: Path) -> None:
+    text = obj(np.zeros((0, 3), dtype=int)) + "f 1 2 \\\n  3 # a comment\n# f 9 9 9\n"
+    (tmp_path / "m.obj").write_text(text, encoding="utf-8-sig")
+    got = read(tracks, tmp_path / "m.obj")
+    assert got.mesh is not None
+    np.testing.assert_array_equal(got.mesh.faces, [[0, 1, 2]])
+
+
 def test_mixed_polygons_become_triangles(tmp_path: Path, tracks: Path) -> None:
     (tmp_path / "m.obj").write_text(obj(np.zeros((0, 3), dtype=int)) + "f 1 2 3\nf 1 2 3 4 5\n")
     got = read(tracks, tmp_path / "m.obj")

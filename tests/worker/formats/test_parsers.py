@@ -46,6 +46,7 @@ LIST = PLY_FACE.replace("vertex_indices", "others")
     [
         (read_csv, observations("0.5,0,1,2"), Limits(), "damaged_file"),
         (read_csv, observations(), Limits(), "damaged_file"),
+        (read_csv, b"frame,point,x,y,x\n0,0,1,2,3\n", Limits(), "unreadable_table"),
         (read_csv, observations("0,0,1,2", "100000,0,1,2"), Limits(), "too_large"),
         (read_csv, observations("0,0,1,2", "0,0,1,2"), Limits(), "duplicate_observation"),
         (read_csv, observations("0,0,1,2", "0,1,1,2"), BRIEF, "too_large"),

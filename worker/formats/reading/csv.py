@@ -82,13 +82,15 @@ def _observations(columns: list[str], rows: list[list[float]], *, field: str, li
     """Arrange observations as arrays."""
     table = np.array(rows, dtype=np.float64).reshape(-1, len(columns))
     index = {name: column for column, name in enumerate(columns)}
+    twice = next((name for name in (*COLUMNS, *CONFIDENCE) if columns.count(name) > 1), None)
+    if twice is not None:
+        raise InvalidInput(
+            "unreadable_table", field=field, expected="each column once", got=f"two columns {twice}", hint="Rename or remove one of them."
+        )  # fmt: skip
+    if len(table) == 0:
+        raise damaged(field, "no observations below the names of the columns")
     numbers = table[:, [index["frame"], index["point"]]]
-    if (
-        len(table) == 0
-        or not np.isfinite(numbers).all()
-        or (numbers != np.rint(numbers)).any()
-        or np.abs(numbers).max() > 2**31
-    ):
+    if not np.isfinite(numbers).all() or (numbers != np.rint(numbers)).any() or np.abs(numbers).max() > 2**31:
         raise damaged(field, "frames or points that are not whole numbers")
     frames = (numbers[:, 0] - numbers[:, 0].min()).astype(np.int64)
     names, points = np.unique(numbers[:, 1].astype(np.int64), return_inverse=True)
@@ -101,9 +103,12 @@ def _observations(columns: list[str], rows: list[list[float]], *, field: str, li
         )
     places = frames * len(names) + points
     ordered = np.sort(places)  # for 3 million observations 70 times as fast as `np.unique`, which hashes them
-    if (ordered[1:] == ordered[:-1]).any():
+    again = np.flatnonzero(ordered[1:] == ordered[:-1])
+    if len(again) > 0:
+        frame, point = divmod(int(ordered[again[0]]), len(names))
         raise InvalidInput(
-            "duplicate_observation", field=field, expected="each point once in a frame", got="a frame and point twice",
+            "duplicate_observation", field=field, expected="each point once in a frame",
+            got=f"frame {frame + int(numbers[:, 0].min())} with point {names[point]} twice",
             hint="Keep one line for each frame and point.",
         )  # fmt: skip
     tracks = np.full((count * len(names), 2), np.nan)

@@ -6,6 +6,7 @@ therefore parsed here, `v` and `f` only, and PLY by plyfile, which keeps rows as
 
 from __future__ import annotations
 
+import codecs
 import io
 import re
 from typing import IO
@@ -32,12 +33,14 @@ def read_obj(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     """
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
-    number = 0
+    number, begun = 0, b""
     while line := stream.readline(MAX_LINE + 1):
         number += 1
+        line = begun + (line.removeprefix(codecs.BOM_UTF8) if number == 1 else line)
         if len(line) > MAX_LINE or b"\0" in line:
             raise damaged(field, f"line {number}, which is longer than {MAX_LINE:,} bytes or not text")
-        words = line.split()
+        begun = line.rstrip()[:-1] + b" " if line.rstrip().endswith(b"\\") else b""
+        words = [] if begun else line.partition(b"#")[0].split()
         if not words:
             continue
         try:

@@ -1,0 +1,1 @@
+"""Check the options of a film, and choose its shot and template."""

@@ -1,0 +1,130 @@
+"""Choose the shot and the template of a film, and carry the region to the template."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pliant.tracking.decoding.film import LEAST_FRAMES, Film
+from pliant.tracking.errors import FilmError
+from pliant.tracking.flow import Bools
+from pliant.tracking.frame_store import FrameStore
+from pliant.tracking.planning.options import no_such_frame
+from pliant.tracking.records import OnStep
+from pliant.tracking.region import transport
+from pliant.tracking.seeding import default_step, place
+from pliant.tracking.survey import Survey, sharpest
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Resources shared by all stages."""
+
+    film: Film
+    store: FrameStore
+    pool: ThreadPoolExecutor
+    on_step: OnStep
+    should_stop: Callable[[], bool]
+    on_warnings: Callable[[list[str]], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """Rows `start` to `stop` of the survey, the template's row, and the mask of the template in the tracker's size."""
+
+    start: int
+    stop: int
+    template: int
+    mask: Bools
+
+
+def plan_of(run: Run, found: Survey, mask: Bools | None, *, region_frame: int, template_frame: int | None) -> Plan:
+    """Choose shot and template, and carry the region, a mask `(H, W)` of the film's size in `region_frame`, to the template.
+
+    By default, the template is the used frame nearest to the region's, or a sharp one in the middle if there is no region.
+
+    Raises
+    ------
+    FilmError
+        A frame beyond the film's end, a template outside the region's shot, a shot of fewer than 3 frames, or a lost region.
+    TrackingStopped
+        `run.should_stop` returned True.
+    """
+    first, last = found.used
+    origin = None if mask is None else _nearest(found.indices, region_frame, "region_frame")
+    template = None
+    if template_frame is not None:
+        template = first + _nearest(found.indices[first:last], template_frame, "template_frame")
+    start, stop = _shot(found, template if origin is None else origin)
+    if template is None:
+        template = sharpest(found.sharpness, start, stop) if origin is None else min(max(origin, start), stop - 1)
+    if not start <= template < stop:
+        raise FilmError(
+            "no_such_frame", field="template_frame", got=str(template_frame),
+            expected=f"a frame of the region's shot, {found.indices[start]} to {found.indices[stop - 1]}",
+            hint="Choose one of these, or draw the region in the shot of the template (region_frame).",
+        )  # fmt: skip
+    height, width = run.store.read(0).shape
+    if mask is None or origin is None:
+        return Plan(start, stop, template, np.ones((height, width), dtype=bool))
+    scaled = np.asarray(cv2.resize(mask.astype(np.uint8) * 255, (width, height), interpolation=cv2.INTER_AREA) >= 128)
+    if template != origin:
+        scaled = _carry(run, scaled, origin, template)
+    return Plan(start, stop, template, scaled)
+
+
+def _shot(found: Survey, row: int | None) -> tuple[int, int]:
+    """Return the used rows, from start to stop, of the shot that contains a row; None: of the longest shot."""
+    shots = list(itertools.pairwise([0, *found.cuts, len(found.indices)]))
+    if row is None:
+        start, stop = max(shots, key=lambda shot: shot[1] - shot[0])
+    else:
+        start, stop = next(shot for shot in shots if shot[0] <= row < shot[1])
+    first, last = max(start, found.used[0]), min(stop, found.used[1])
+    if first >= last:
+        raise FilmError(
+            "region_lost", field="region_frame", expected="a region drawn in the shot of the frames used",
+            got=f"one drawn in frames {found.indices[start]} to {found.indices[stop - 1]}, before or after a cut",
+            hint="Draw the region on one of the frames used, or use other frames.",
+        )  # fmt: skip
+    if last - first < LEAST_FRAMES:
+        raise FilmError(
+            "too_few_frames", field="film", expected=f"a shot of at least {LEAST_FRAMES} frames", got=f"{last - first} between two cuts",
+            hint="Film the object in one take, or draw the region in a longer shot (region_frame).",
+        )  # fmt: skip
+    return first, last
+
+
+def _carry(run: Run, mask: Bools, origin: int, template: int) -> Bools:
+    """Carry the region to the template, with points without texture too, because only the outline counts."""
+    step = default_step(mask)
+    seeds, _ = place(run.store.read(origin), mask, step=step, everywhere=True)
+    if len(seeds.points) == 0:
+        raise FilmError(
+            "region_lost", field="region", expected="a region that can be followed to the template",
+            got=f"one narrower than {2 * step:.0f} pixels of the tracker's frames",
+            hint="Draw a larger region, or draw it in the template frame itself (region_frame).",
+        )  # fmt: skip
+    carried = transport(
+        run.store.read, mask, seeds, origin, template, pool=run.pool, on_step=run.on_step, should_stop=run.should_stop
+    )
+    if carried.sum() < 0.1 * mask.sum():
+        raise FilmError(
+            "region_lost", field="region", expected="a region that can be followed to the template",
+            got=f"{carried.sum() / max(mask.sum(), 1):.0%} of it left there",
+            hint="Draw the region in the template frame itself (region_frame), or choose a template nearer to it.",
+        )  # fmt: skip
+    return carried
+
+
+def _nearest(indices: NDArray[np.int64], frame: int, field: str) -> int:
+    """Return the row of the frame nearest to a frame number, which may be that of a skipped frame after the last one."""
+    last = int(2 * indices[-1] - indices[-2]) - 1
+    if frame > last:
+        raise no_such_frame(field, frame, 0, last)
+    return int(np.abs(indices - frame).argmin())
