@@ -31,7 +31,7 @@ from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR
 from pliant.solver.records import Floats
-from pliant.solver.tracks.completion import POINTS_PER_CHUNK, Filling, spans
+from pliant.solver.tracks.completion import Filling, spans
 from pliant.solver.tracks.normalization import Normalized
 from scipy import linalg
 
@@ -113,10 +113,6 @@ class Perspective:
     depth: Floats | DepthMap = field(default_factory=lambda: np.zeros((0, 0)))
     """D of the latest cameras and covariance, shape `(F, 2F)`."""
 
-    middle: Floats = field(default_factory=lambda: np.zeros((0, 2)))
-    """Mean corrected point of all points relative to the principal point, normalized units, shape `(F, 2)`; its depth D w is the origin of
-    all depths."""
-
     @property
     def bends(self) -> bool:
         """Whether the tracks are corrected for perspective."""
@@ -166,7 +162,7 @@ def depths_of(
     start : array, shape (F, P), optional
         Depths to start the fixed point from; 0 without it.
     origin : array, shape (F, 1), optional
-        D w of the mean of all points, if the points are only some of them; their own mean would be another origin.
+        From `mean_depth`, for some of the points: their own mean would be another origin than that of the others.
     """
     depths = np.zeros(views.shape[:2]) if start is None else start
     for _ in range(DEPTH_STEPS if curvature else 1):
@@ -179,9 +175,14 @@ def depths_of(
     return depths
 
 
-def _origin(view: Perspective, middle: Floats) -> Floats:
-    """Return the depth of the point whose corrected image is `middle (F, 2)`, shape `(F, 1)`."""
-    return np.asarray(view.depth @ columns(middle[:, None]))
+def mean_depth(view: Perspective) -> Floats:
+    """Return the mean of D w over the sample, shape `(F, 1)`: the origin of its depths, and of those of all other points.
+
+    Scales and κ are learned from the sample. With the mean of all points as origin, which differs in depth, the errors of a face and of a
+    speaking head at 3, 5 and 10 half-sizes are 1.06 to 1.18 times as large.
+    """
+    images = _corrected_by(view, view.sample)
+    return np.asarray(view.depth @ columns(images.mean(axis=1, keepdims=True)))
 
 
 def corrected(views: Floats, depths: Floats, curvature: float) -> Floats:
@@ -219,10 +220,9 @@ def corrected_moments(view: Perspective, normalized: Normalized) -> tuple[Floats
     gram (2F, 2F), translations (F, 2), sample (F, S, 2)
         Translations are relative to the centroids of the visible points.
     """
-    frames, origin = len(normalized.points), None
+    frames = len(normalized.points)
     gram, total, used = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2)), 0
-    if normalized.points.shape[1] > POINTS_PER_CHUNK:  # chunks must share an origin
-        origin = _origin(view, _mean_corrected(view, normalized))
+    origin = mean_depth(view)
     for _, points in spans(normalized, view.filling):
         changed = _corrected_by(view, points + view.offsets[:, None], origin) - view.offsets[:, None]
         stacked = columns(changed)
@@ -234,23 +234,13 @@ def corrected_moments(view: Perspective, normalized: Normalized) -> tuple[Floats
     return gram / used - np.outer(flat, flat), mean, centred(_corrected_by(view, view.sample))
 
 
-def _mean_corrected(view: Perspective, normalized: Normalized) -> Floats:
-    """Return the mean corrected point relative to the principal point, shape `(F, 2)`, from depths about the sample's mean."""
-    total, used = np.zeros((len(normalized.points), 2)), 0
-    origin = _origin(view, _corrected_by(view, view.sample).mean(axis=1))
-    for _, points in spans(normalized, view.filling):
-        total += _corrected_by(view, points + view.offsets[:, None], origin).sum(axis=1)
-        used += points.shape[1]
-    return total / used
-
-
 def _corrected_by(view: Perspective, views: Floats, origin: Floats | None = None) -> Floats:
     return corrected(views, depths_of(view.depth, views, view.curvature, origin=origin), view.curvature)
 
 
 def posterior_depths(view: Perspective, normalized: Normalized) -> Floats:
     """Return the depth of every point and frame, shape `(F, P)`; 0 for points that no frame shows."""
-    found, origin = np.zeros(normalized.visible.shape), _origin(view, view.middle)
+    found, origin = np.zeros(normalized.visible.shape), mean_depth(view)
     for places, points in spans(normalized, view.filling):
         views = points + view.offsets[:, None]
         found[:, places] = depths_of(view.depth, views, view.curvature, origin=origin)

@@ -197,4 +197,4 @@ def _perspective(
     if not view.bends:
         return replace(view, sample=np.zeros((0, 0, 2)))
     seen = _filled(views, shapes, poses, as_seen=True)
-    return replace(view, sample=seen, depth=depth_map(rotations, scales, covariance), middle=poses.translations)
+    return replace(view, sample=seen, depth=depth_map(rotations, scales, covariance))

@@ -169,7 +169,6 @@ def _applied(
     every = stretched(found, used, np.asarray(estimate.rotations))
     view = replace(view, depth=depth_map(every.rotations, every.scales, every.covariance))
     gram, translations, sample = corrected_moments(view, normalized)
-    view = replace(view, middle=view.offsets + translations)
     read_only(every.rotations)
     return replace(
         estimate, rotations=every.rotations, gram=gram, translations=translations, sample=sample, perspective=view
