@@ -16,7 +16,7 @@ from pliant.service.multipart import File, Form, FormRules, own_name
 from pliant.service.problems import Refusal, from_validation, wrong_input
 from pliant.service.settings import ServiceSettings
 from pliant.worker.artifacts import kinds_for
-from pliant.worker.errors import Conflict, UnknownUpload
+from pliant.worker.errors import Conflict, UnknownJob, UnknownUpload
 from pliant.worker.execution.solver_settings import solver_settings
 from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.sources import FilmSource, is_source, open_source, save_source
@@ -140,9 +140,7 @@ def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept 
     Raises
     ------
     Refusal
-        The form has files as well, or an option differs from how the stored tracks were read.
-    UnknownJob
-        There is no such job.
+        There is no such job, the form has files as well, or an option differs from how the stored tracks were read.
     NotAllowedNow
         The job only wrote further files of another one.
     """
@@ -155,7 +153,10 @@ def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept 
             ProblemCode.CONFLICTING_PARTS, field=KEPT, expected="either inputs_of or files", got=f"inputs_of and {', '.join(others)}",
             hint="Leave one of them out.",
         )  # fmt: skip
-    job, file = jobs.kept_inputs(id, folder / "kept.npz")
+    try:
+        job, file = jobs.kept_inputs(id, folder / "kept.npz")
+    except UnknownJob as error:
+        raise Refusal(ProblemCode.UNKNOWN_JOB, detail=str(error), field=KEPT) from error
     if is_source(file):
         source = open_source(file, folder / "kept")
         files = {

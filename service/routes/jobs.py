@@ -45,7 +45,7 @@ Prefer = Annotated[
     str | None, Header(description="`wait=20` answers when the job has ended, or after 20 s, whichever comes first.")
 ]
 _WAIT = re.compile(r"\s*wait\s*=\s*(\d{1,6})\s*", re.IGNORECASE)
-_SUBMIT_ERRORS = problems(400, 401, 403, 408, 409, 413, 415, 422, 429, 503, 507)
+_SUBMIT_ERRORS = problems(400, 401, 403, 404, 408, 409, 413, 415, 422, 429, 503, 507)
 _LOCATION = {"Location": {"description": "The job's address.", "schema": {"type": "string"}}}
 
 

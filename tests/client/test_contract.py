@@ -363,8 +363,9 @@ def test_stored_inputs_can_be_rerun_with_other_options(client: Client) -> None:
     assert (caught.value.code, caught.value.problem.field) == ("conflicting_parts", "options.stride")
     with pytest.raises(BadArgument, match="expected no other inputs, got tracks as well"):
         client.submit(moving_points(), inputs_of=first.id)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFound) as unknown:
         client.submit(inputs_of="no-such-job")
+    assert (unknown.value.code, unknown.value.problem.field) == ("unknown_job", "inputs_of")
 
 
 def test_a_share_link_reads_one_result_until_it_is_revoked(

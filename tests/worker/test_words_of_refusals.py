@@ -232,7 +232,7 @@ CASES: dict[str, Case] = {
     "frames that are no whole numbers": Case(tracks=lambda: b"frame,point,x,y\n0.5,0,1,2\n",
         words="tracks: expected a complete, consistent file, got frames or points that are not whole numbers. Write the file again."),
     "one observation twice": Case(tracks=lambda: b"frame,point,x,y\n0,0,1,2\n0,0,1,2\n",
-        words="tracks: expected each point once in a frame, got a frame and point twice. Keep one line for each frame and point."),
+        words="tracks: expected each point once in a frame, got frame 0 with point 0 twice. Keep one line for each frame and point."),
     "other names": Case(tracks=lambda: npz(Rs_gt=WALK, vis_e=WALK),
         words="tracks: expected an array named tracks (F, P, 2), or W (2F, P), got Rs_gt (6, 20, 2), vis_e (6, 20, 2). Save as numpy.savez('tracks.npz', tracks=points, visibility=visible)."),
     "truth-values as tracks": Case(tracks=lambda: npz(tracks=np.ones((6, 20, 2), bool)),

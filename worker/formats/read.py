@@ -19,7 +19,7 @@ from pliant.worker.formats.meshes.triangulation import triangulate
 from pliant.worker.formats.reading.containers import read_arrays
 from pliant.worker.formats.records import MAX_COORDINATE, GroundTruth, Inputs, Limits, Selection
 from pliant.worker.formats.tracks.decimation import thin
-from pliant.worker.formats.tracks.film_tracks import FilmTracks, read_film_tracks
+from pliant.worker.formats.tracks.film_tracks import FilmTracks, read_film_tracks, tracks_options
 from pliant.worker.formats.tracks.interpretation import Understood, understand
 from pliant.worker.formats.tracks.selection import chosen_frames, hide_sparsely_observed
 from pliant.worker.formats.tracks.tracker_formats import KNOWN, OWN
@@ -71,9 +71,11 @@ def read_inputs(
         given_frames=understood.points.shape[0], given_points=understood.points.shape[1],
         num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(),
         notes=[*understood.notes, *chosen.notes, *truth_notes],
-        estimate=estimated(checked.num_frames, checked.num_points, options, has_rotations=cameras is not None),
         **({} if film is None else _stated(film, chosen.selection)),
     )  # fmt: skip
+    known = tracks_options(options, interpretation)
+    estimate = estimated(checked.num_frames, checked.num_points, known, has_rotations=cameras is not None)
+    interpretation = interpretation.model_copy(update={"estimate": estimate})
     texture = None if film is None or film.texture is None else film.texture.at_points(chosen.selection.points)
     selection = chosen.selection if chosen.selection.narrows else None
     names = understood.point_names

@@ -11,6 +11,7 @@ from pliant.solver.errors import InvalidInput
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.tracker import Tracked
 from pliant.worker.formats import load_inputs, read_inputs, save_inputs
+from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.tracks.film_tracks import tracks_options
 
 FRAMES, ROWS, COLUMNS = 5, 4, 5
@@ -58,6 +59,7 @@ def test_every_array_of_the_tracker_is_used(tmp_path: Path) -> None:
         24.0,
     )
     assert tracks_options(Options(), interpretation) == Options(image_size="64x48", fps=24)
+    assert interpretation.estimate == estimated(FRAMES, POINTS, Options(image_size="64x48"))
     save_inputs(inputs, tmp_path / "stored.npz")
     back = load_inputs(tmp_path / "stored.npz")
     assert back.interpretation == interpretation
