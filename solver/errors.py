@@ -71,7 +71,11 @@ def numeric(value: ArrayLike, field: str, hint: str, *, kinds: str = "fiu") -> N
         array = np.ma.filled(np.ma.asarray(value, dtype=float), np.nan) if masked else np.asarray(value)
     except (TypeError, ValueError):
         raise wrong_input(
-            field, "wrong_type", "a rectangular array of numbers", f"a {type(value).__name__} that is none", hint
+            field,
+            "wrong_type",
+            "a rectangular array of numbers",
+            f"a {type(value).__name__} that NumPy cannot convert",
+            hint,
         ) from None
     if array.dtype.kind not in kinds:
         expected = "integers" if "f" not in kinds else "bool or numbers" if "b" in kinds else "real numbers"

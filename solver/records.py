@@ -203,12 +203,12 @@ class KnownCamera:
             raise wrong_input(
                 "cameras.focal", "out_of_range", "a positive, finite length", str(focal), "Give it in the tracks' unit."
             )
-        if principal_point is not None and not (
-            np.shape(principal_point) == (2,) and np.isfinite(np.asarray(principal_point, dtype=np.float64)).all()
-        ):
-            raise wrong_input(
-                "cameras.principal_point", "not_finite", "two finite numbers", str(principal_point), "Give x and y."
-            )
+        if principal_point is not None:
+            point = np.asarray(numeric(principal_point, "cameras.principal_point", "Give x and y."), dtype=np.float64)
+            if point.shape != (2,) or not np.isfinite(point).all():
+                raise wrong_input(
+                    "cameras.principal_point", "not_finite", "two finite numbers", str(principal_point), "Give x and y."
+                )
         given = numeric(rotations, "rotations", "Give one rotation a frame.").astype(np.float64)
         if given.ndim != 3 or given.shape[1:] not in ((2, 3), (3, 3)) or len(given) == 0:
             raise wrong_input(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -232,19 +232,21 @@ def baselines(records: Records) -> Figure:
 
 
 def distance(records: Records) -> Figure:
-    """Plot error against camera distance (infinite: orthography), for each sequence at its largest number of points."""
+    """Plot error against camera distance (infinite: orthography), for each sequence at the number of points with the most measurements."""
     places = {"3": 0, "5": 1, "10": 2, "inf": 3}
     chosen = [r for r in records if r["metric"] == "e3d_frame_scaled" and len(r["sequence"].split()) == 2]
     titles = {"orthographic": "orthographic camera model", "auto": "camera=auto (default), φ not given"}
     figure, grid = plt.subplots(1, len(titles), figsize=(4 * len(titles), 3.2), sharey=True, squeeze=False)
     for axes, method in zip(grid[0], titles, strict=True):
         for number, (name, label) in enumerate(SEQUENCES.items()):
-            own = [r for r in chosen if r["sequence"].split()[0] == name and r["method"] == method]
-            most = max((int(r["sequence"].split("=")[1]) for r in own), default=0)
-            points = sorted((places[r["distance"]], r["value"]) for r in own if r["sequence"].endswith(f"={most}"))
-            if points:
+            every = [r for r in chosen if r["sequence"].split()[0] == name]
+            counts = Counter(int(r["sequence"].split("=")[1]) for r in every)
+            count = max(counts, key=lambda each: (counts[each], each), default=0)
+            own = [r for r in every if r["method"] == method and r["sequence"].endswith(f"={count}")]
+            if own:
+                points = sorted((places[r["distance"]], r["value"]) for r in own)
                 axes.semilogy(
-                    *np.array(points).T, marker="o", ms=4, color=f"C{number % 10}", label=f"{label} ({most} points)"
+                    *np.array(points).T, marker="o", ms=4, color=f"C{number % 10}", label=f"{label} ({count} points)"
                 )
         axes.set_xticks(list(places.values()), ["3", "5", "10", "∞"])
         axes.set_title(titles[method], fontsize=9)

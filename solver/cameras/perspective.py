@@ -178,8 +178,8 @@ def depths_of(
 def mean_depth(view: Perspective) -> Floats:
     """Return the mean of D w over the sample, shape `(F, 1)`: the origin of its depths, and of those of all other points.
 
-    Scales and κ are learned from the sample. With the mean of all points as origin, which differs in depth, the errors of a face and of a
-    speaking head at 3, 5 and 10 half-sizes are 1.06 to 1.18 times as large.
+    Scales and κ are learned from the sample. With the mean of all points as origin, which differs in depth, the errors at 3, 5 and 10
+    half-sizes are 1.06 to 1.18 times as large for face scans and a speaking head, .99 times for a horse (1,000 points).
     """
     images = _corrected_by(view, view.sample)
     return np.asarray(view.depth @ columns(images.mean(axis=1, keepdims=True)))

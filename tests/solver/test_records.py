@@ -186,6 +186,10 @@ class TestKnownCamera:
         error = refusal(KnownCamera.from_arrays, np.tile(np.eye(3), (4, 1, 1)), principal_point=point)
         assert (error.field, error.code) == ("cameras.principal_point", "not_finite")
 
+    def test_a_principal_point_is_made_of_numbers(self) -> None:
+        error = refusal(KnownCamera.from_arrays, np.tile(np.eye(3), (4, 1, 1)), principal_point=("a", "b"))
+        assert (error.field, error.code) == ("cameras.principal_point", "wrong_type")
+
 
 class TestSettings:
     @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Mask pictures as cameras and editors write them, and what is said about those that hold no region."""
+"""Mask pictures with an EXIF orientation, 16-bit levels or transparency, and the messages about unusable ones."""
 
 from __future__ import annotations
 

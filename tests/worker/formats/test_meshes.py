@@ -91,7 +91,7 @@ def test_negative_obj_indices_count_from_the_end(tmp_path: Path, tracks: Path) -
 
 
 def test_obj_files_may_have_a_byte_order_mark_comments_and_continued_lines(tmp_path: Path, tracks: Path) -> None:
-    text = obj(np.zeros((0, 3), dtype=int)) + "f 1 2 \\\n  3 # a comment\n# f 9 9 9\n"
+    text = obj(np.zeros((0, 3), dtype=int)) + "# C:\\meshes\\\nf 1 2 \\\n  3 # a comment\n# f 9 9 9\n"
     (tmp_path / "m.obj").write_text(text, encoding="utf-8-sig")
     got = read(tracks, tmp_path / "m.obj")
     assert got.mesh is not None
@@ -158,6 +158,7 @@ def test_a_grid_of_points_in_random_order_or_hidden_is_accepted(tmp_path: Path) 
         ("f 1 2 2\n", "degenerate_face"),
         ("f a b c\n", "damaged_file"),
         ("v 1 2\n", "damaged_file"),
+        ("f 1 2 \\", "damaged_file"),
         ("f " + "1 " * 5000 + "\n", "damaged_file"),
     ],
 )

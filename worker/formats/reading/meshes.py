@@ -39,8 +39,9 @@ def read_obj(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
         line = begun + (line.removeprefix(codecs.BOM_UTF8) if number == 1 else line)
         if len(line) > MAX_LINE or b"\0" in line:
             raise damaged(field, f"line {number}, which is longer than {MAX_LINE:,} bytes or not text")
-        begun = line.rstrip()[:-1] + b" " if line.rstrip().endswith(b"\\") else b""
-        words = [] if begun else line.partition(b"#")[0].split()
+        line = line.partition(b"#")[0].rstrip()  # before the continuation: a comment may end in a Windows path
+        begun = line[:-1] + b" " if line.endswith(b"\\") else b""
+        words = [] if begun else line.split()
         if not words:
             continue
         try:
@@ -54,6 +55,8 @@ def read_obj(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
             raise too_large(
                 field, expected=f"at most {limits.max_points:,} vertices and {limits.max_faces:,} faces", got="more"
             )
+    if begun:
+        raise damaged(field, "a last line that is continued on none")
     if not vertices:
         raise InvalidInput(
             "unknown_format", field=field, expected="a mesh file", got="text without vertices", hint=NOT_A_MESH
