@@ -112,13 +112,13 @@ def test_waiting_ends_with_the_job_or_its_time_limit(running: Running, http: htt
     job = submit(http, name="awaited")
     begun = time.monotonic()
     early = http.get(f"/v1/jobs/{job.id}", headers={"Prefer": "wait=1"})
-    assert 0.9 < time.monotonic() - begun < 5
+    assert 0.9 < time.monotonic() - begun < 14
     assert (early.json()["status"], early.headers["preference-applied"]) == (Status.QUEUED, "wait=1")
     timer = threading.Timer(0.5, finish, (running, job.id, b"x"))
     timer.start()
     begun = time.monotonic()
     assert http.get(f"/v1/jobs/{job.id}", headers={"Prefer": "respond-async, wait=15"}).json()["status"] == "succeeded"
-    assert time.monotonic() - begun < 8
+    assert time.monotonic() - begun < 14
     timer.join()
 
 
@@ -265,7 +265,7 @@ def test_requests_time_out_and_health_checks_pass_if_the_store_hangs(
             thread.join()
         http.close()
         assert answers == [503] * 60
-        assert time.monotonic() - began < 10
+        assert time.monotonic() - began < 20
 
 
 def test_scratch_folders_of_dead_processes_are_removed_live_ones_kept(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ def test_an_idle_stream_sends_comment_lines(restless: Running) -> None:
             lines = answer.iter_lines()
             signs = [next(line for line in lines if line.startswith(":")) for _ in range(4)]
         assert signs == [": ping"] * 4
-        assert 0.6 < time.monotonic() - begun < 5
+        assert 0.6 < time.monotonic() - begun < 20
 
 
 def test_followers_are_woken_in_batches_so_other_requests_can_run() -> None:
@@ -201,7 +201,7 @@ def test_revoked_or_expired_tokens_end_their_streams(serve: Serve, how: str, mon
                 monkeypatch.setattr("pliant.service.middleware.auth.utc_now", lambda: later)
             begun = time.monotonic()
             rest = list(lines)
-        assert time.monotonic() - begun < 5
+        assert time.monotonic() - begun < 20
         assert all(line in ("", ": ping") for line in rest)
         assert http.get(f"/v1/jobs/{job.id}/events").status_code == 401
 
@@ -255,7 +255,7 @@ def test_a_wait_is_capped_by_the_service(serve: Serve) -> None:
         begun = time.monotonic()
         answer = http.get(f"/v1/jobs/{job.id}", headers={"Prefer": "wait=600"})
         assert answer.headers["preference-applied"] == "wait=1"
-        assert time.monotonic() - begun < 5
+        assert time.monotonic() - begun < 20
 
 
 def test_resuming_after_the_final_event_returns_no_events(running: Running, http: httpx.Client) -> None:

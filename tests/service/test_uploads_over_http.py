@@ -117,7 +117,7 @@ def test_a_reconnecting_client_replaces_its_dead_connection(running: Running, ht
         began = time.monotonic()
         at = offset(http, path)
         answer = http.patch(path, content=DATA[at:], headers={"Upload-Offset": str(at)})
-        assert time.monotonic() - began < 5
+        assert time.monotonic() - began < 15
         assert answer.json()["sha256"] == hashlib.sha256(DATA).hexdigest()
         heard(dead, b'"upload_taken_over"')
 

@@ -35,7 +35,7 @@ def test_heartbeats_do_not_delay_supervision_while_the_server_hangs(settings: Se
     connection.execute_command("CLIENT", "PAUSE", int(1000 * PAUSE))
     begun = time.monotonic()
     worker._keep_execution(job)
-    assert time.monotonic() - begun < PAUSE / 2
+    assert time.monotonic() - begun < 0.9 * PAUSE
     connection.ping()  # waits until the pause is over
     worker._keep_execution(job)
     assert connection.hget(job.key, "last_heartbeat") > before
