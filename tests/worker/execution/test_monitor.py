@@ -318,18 +318,19 @@ def test_time_left_counts_down_between_reports() -> None:
 
 def test_a_background_thread_ticks_between_reports() -> None:
     ticked = threading.Event()
-    told: list[Progress] = []
+    threads: list[threading.Thread] = []
 
-    def hear(progress: Progress) -> None:
-        told.append(progress)
-        if len(told) > 1:
+    def hear(_: Progress) -> None:
+        threads.append(threading.current_thread())
+        if len(threads) > 1:
             ticked.set()
 
     reporter = Reporter(hear)
     with reporter.ticking():
         reporter.part("solving", 0.1, stage="cameras")
         assert ticked.wait(60)
-    assert not any(thread.name == "pliant-ticks" for thread in threading.enumerate())
+    assert threads[0] is threading.current_thread() is not threads[1]
+    assert not threads[1].is_alive()
 
 
 def test_the_log_is_complete_before_the_record_is_final(
