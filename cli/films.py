@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +25,24 @@ def is_film(path: Path, region: Path | None) -> bool:
     from pliant.worker.films.sources import looks_like_film
 
     return region is not None or looks_like_film(path)
+
+
+@contextmanager
+def as_one_file(path: Path) -> Iterator[Path]:
+    """Yield the file to send to a service: a folder of pictures is packed into a temporary zip, whose bytes depend on the pictures only."""
+    from pliant.worker.films.sources import PICTURES
+
+    if not path.is_dir():
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="pliant-pictures-") as scratch:
+        packed = Path(scratch) / "pictures.zip"
+        with zipfile.ZipFile(packed, "w") as archive:
+            for each in sorted(path.iterdir()):
+                if each.suffix.lower() in PICTURES and each.name[0] != "." and each.is_file():
+                    with each.open("rb") as picture, archive.open(zipfile.ZipInfo(each.name), "w") as entry:
+                        shutil.copyfileobj(picture, entry)
+        yield packed
 
 
 def refuse_parts_of_tracks(**parts: object) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from pliant.cli.films import is_film
+from pliant.cli.films import as_one_file, is_film
 from pliant.cli.ids import find_job
 from pliant.cli.paths import check_inputs, different_files, output_folder, results_folder
 from pliant.cli.session import (
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 Files = Annotated[
     list[Path],
     typer.Argument(
-        help="Track files in any format `pliant inspect` reads, or a film. Several files, a folder of track files or a quoted "
-        "pattern such as 'takes/*.npz' make a job each.",
+        help="Track files in any format `pliant inspect` reads, a film, or a folder with its pictures. Several of them, a folder of track "
+        "files or a quoted pattern such as 'takes/*.npz' make a job each.",
         metavar="FILE...",
         show_default=False,
     ),
@@ -91,11 +91,12 @@ def submit(
     if output is not None:  # a named job may be an earlier one, whose files may be here already
         output_folder(output, force=force or job_id is not None or key is not None)
     given = {
-        "film" if is_film(tracks, region) else "tracks": tracks, "region": region, **parts, "options": options,
+        "region": region, **parts, "options": options,
         "name": name_of(name, tracks), "job_id": job_id, "idempotency_key": key, "priority": priority, "timeout": timeout,
         "webhook_secret": None if webhook is None else os.environ.get("PLIANT_WEBHOOK_SECRET"),
     }  # fmt: skip
-    with session.client(url, as_json=as_json) as client:
+    with session.client(url, as_json=as_json) as client, as_one_file(tracks) as file:
+        given["film" if is_film(tracks, region) else "tracks"] = file
         job = _submitted(session, client, given, wait=waits, output=output, force=force)
         show_job(job.record, as_json=as_json)
         if not job.status.final and not as_json:

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pliant.cli.exits import Exit
-from pliant.cli.films import is_film
-from pliant.cli.paths import different_files, made_folder, output_folder
+from pliant.cli.films import as_one_file, is_film
+from pliant.cli.paths import different_files, made_folder, output_folder, tracks_or_film
 from pliant.cli.session import LINE_EVERY, Session, name_of
 from pliant.cli.show import COLOURS, VERDICTS, details_of, err, explained_at, out, print_json
 
@@ -115,7 +115,6 @@ class Batch:
             Such an option was given, a file cannot be read, two files have the same name, or a folder is not writable.
         """
         from pliant.client.errors import BadArgument
-        from pliant.client.input_files import existing_file
 
         given = [word for word, value in (("--name", name), ("--id", job_id), ("--region", region)) if value]
         if given:
@@ -123,7 +122,7 @@ class Batch:
                 f"{', '.join(given)}: expected one file, got {len(self.files)}. Leave it out, or submit the files separately."
             )
         for file in self.files:
-            existing_file(file, "tracks")
+            tracks_or_film(file)
         if self.output is None:
             return
         names = [file.stem for file in self.files]
@@ -167,11 +166,12 @@ class Batch:
             bar.label = str(file)
             try:
                 film = is_film(file, None)
-                job = client.submit(
-                    None if film else file, film=file if film else None, name=name_of("", file), options=self.options,
-                    idempotency_key=self._key_of(file, common), priority=self.priority, timeout=self.timeout,  # type: ignore[arg-type]
-                    webhook_secret=secret, on_upload=bar.on_upload, **self.shared,
-                )  # fmt: skip
+                with as_one_file(file) as sent:
+                    job = client.submit(
+                        None if film else sent, film=sent if film else None, name=name_of("", file), options=self.options,
+                        idempotency_key=_key_of(sent, name_of("", file), common), priority=self.priority, timeout=self.timeout,  # type: ignore[arg-type]
+                        webhook_secret=secret, on_upload=bar.on_upload, **self.shared,
+                    )  # fmt: skip
             except NotAuthorized:
                 raise
             except APIStatusError as error:
@@ -251,10 +251,9 @@ class Batch:
         digest = None if secret is None else hashlib.sha256(secret.encode()).hexdigest()
         return json.dumps([self.key, self.options, self.priority, parts, digest], sort_keys=True)
 
-    def _key_of(self, file: Path, common: str) -> str:
-        """Return the idempotency key of a file: a digest of its content, its name and the shared parameters."""
-        from pliant.client.multipart import sha256
 
-        content = sha256(file) if file.is_file() else str(file.absolute())
-        name = name_of("", file)
-        return f"batch/{hashlib.sha256(f'{content} {name} {common}'.encode()).hexdigest()}"
+def _key_of(file: Path, name: str, common: str) -> str:
+    """Return the idempotency key of a file: a digest of its content, its name and the shared parameters."""
+    from pliant.client.multipart import sha256
+
+    return f"batch/{hashlib.sha256(f'{sha256(file)} {name} {common}'.encode()).hexdigest()}"

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from pliant.cli import app
-from pliant.cli.commands.batch import Batch
 from pliant.cli.exits import Exit
 from pliant.cli.session import Session
 from pliant.client.input_files import LONGEST_NAME
@@ -156,7 +155,8 @@ def test_a_rejected_file_is_reported_and_the_others_continue(run: Run, takes: Pa
 def test_a_file_with_a_used_key_is_reported_and_the_others_continue(
     run: Run, takes: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Batch, "_key_of", lambda _, file, *__: str(file.stem == "take-2"))
+    module = importlib.import_module("pliant.cli.commands.batch")
+    monkeypatch.setattr(module, "_key_of", lambda _, name, __: str(name == "take-2"))
     ran = run("submit", takes, "--mesh", "none", "--json")
     assert ran.exit_code == Exit.FAILED, ran.output
     first, second, third = json.loads(ran.stdout)
