@@ -209,7 +209,7 @@ def test_broken_films_invalid_regions_and_zip_bombs_are_rejected(
 def test_a_film_that_cannot_be_tracked_fails_its_job_with_a_remedy(
     running: Running, http: httpx.Client, tmp_path: Path
 ) -> None:
-    grey = films.write_film(tmp_path / "grey.mkv", [np.full((72, 96, 3), 128, np.uint8)] * 5)
+    grey = films.write_film(tmp_path / "grey.mkv", [np.full((72, 96, 3), 126 + i, np.uint8) for i in range(5)])
     done = work(running, send(http, grey.read_bytes()).id)
     assert done.status is Status.FAILED
     assert done.error is not None

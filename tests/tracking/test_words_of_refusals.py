@@ -100,6 +100,8 @@ CASES: dict[str, Case] = {
         words="film: expected an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures, got film.avi without its header (avih). Copy it again."),
     "random bytes": Case(name="film.mkv", data=lambda path: path.write_bytes(film(path).read_bytes()[:64] + bytes(1000)),
         words="film: expected a film with a picture that FFmpeg decodes, got film.mkv. It may be damaged, hold sound only, or use a rare codec. Convert it: ffmpeg -i FILM film.mp4"),
+    "equal frames, as of an interlaced film": Case(name="film.mkv", data=lambda path: films.write_film(path, PICTURES[:1] * 5),
+        words="film: expected frames that differ, got 5 equal frames in film.mkv. If it is not a still picture, it is interlaced. Convert it: ffmpeg -i FILM -vf yadif film.mp4"),
     "absurd pixels": Case(data=lambda path: films.patched(film(path), b"tkhd", 80, struct.pack(">I", 640 << 16)),
         words="film: expected pixels at most 4 times as wide as high, or as high as wide, got film.mp4 with pixels of 10:1. Convert it: ffmpeg -i FILM -vf setsar=1 film.mp4"),
     "more bytes than allowed": Case(data=lambda path: path.write_bytes(film(path).read_bytes().ljust(10_000, b"\0")), given={"limits": FilmLimits(bytes=100)},
@@ -122,6 +124,8 @@ CASES: dict[str, Case] = {
         words="film: expected pictures (.png, .jpg, .jpeg, .webp, .bmp), got none in film. Export the film's frames as PNG or JPEG, numbered in order."),
     "a picture that ends early": Case(name="film.zip", data=zipped(a_png=films.png(PICTURES[0]), b_png=films.png(PICTURES[1])[:-200]),
         words="film: expected pictures that can be decoded, got b.png: …. Save it again as PNG or JPEG."),
+    "a GIF that ends early": Case(name="film.gif", data=lambda path: path.write_bytes(films.gif(PICTURES)[:-500]),
+        words="film: expected pictures that can be decoded, got film.gif: …. Copy it again, or convert the frames that it has: ffmpeg -i FILM film.mp4"),
     "a broken deflate stream": Case(name="film.zip", data=broken_deflate,
         words="film: expected pictures that can be decoded, got 1.png: …. Save it again as PNG or JPEG."),
     "pictures of several sizes": Case(name="film.zip", data=lambda path: films.zip_of(path, {f"{i}.png": films.png(np.zeros((h, w, 3), np.uint8)) for i, (w, h) in enumerate(ODD)}),
@@ -163,5 +167,5 @@ def test_each_invalid_film_gets_its_exact_error_message(name: str, tmp_path: Pat
     case = CASES[name]
     words = str(refused(case, tmp_path))
     if "…" in case.words:  # this part comes from a library
-        words = re.sub(r"\.(png|py): .+\. Save", r".\1: …. Save", words)
+        words = re.sub(r"\.(png|py|gif): .+\. (Save|Copy)", r".\1: …. \2", words)
     assert words == case.words

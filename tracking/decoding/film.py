@@ -104,7 +104,7 @@ class Film:
         Raises
         ------
         FilmError
-            A frame of another size than the first, a broken picture, or a film beyond its limits.
+            A frame of another size than the first, a broken picture, a film whose frames are all equal, or one beyond its limits.
         """
         start, stop, step = self.selection
         used = 0
@@ -351,7 +351,8 @@ def _open_capture(path: Path) -> cv2.VideoCapture:
 def _decode_video(path: Path, fps: float, start: int, stop: int | None, step: int) -> Iterator[Frame]:
     capture = _open_capture(path)
     try:
-        index, last = 0, -1.0
+        index, last, used = 0, -1.0, 0
+        first: NDArray[np.uint8] | None = None
         while (stop is None or index < stop) and capture.grab():
             time = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             # Some files have no timestamps after the first frames, or repeat them.
@@ -361,10 +362,16 @@ def _decode_video(path: Path, fps: float, start: int, stop: int | None, step: in
                 found, image = capture.retrieve()
                 if not found or image is None:
                     return
-                yield Frame(index, time, np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8))
+                picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+                if used == 0 or (first is not None and not np.array_equal(picture, first)):
+                    first = picture if used == 0 else None
+                used += 1
+                yield Frame(index, time, picture)
             index += 1
         if index == 0:
             raise _undecodable(path)
+        if used > 1 and first is not None:
+            raise _unchanging(path, used)
     except cv2.error as error:
         raise _undecodable(path) from error
     finally:
@@ -375,4 +382,16 @@ def _undecodable(path: Path) -> FilmError:
     return FilmError(
         "undecodable_film", field="film", expected="a film with a picture that FFmpeg decodes", got=path.name,
         hint="It may be damaged, hold sound only, or use a rare codec. Convert it: ffmpeg -i FILM film.mp4",
+    )  # fmt: skip
+
+
+def _unchanging(path: Path, count: int) -> FilmError:
+    """Return (not raise) the error for a film whose frames are all equal.
+
+    OpenCV reports no error where FFmpeg cannot convert a frame, as it cannot if the frame is interlaced, and returns the last content of
+    its buffer.
+    """
+    return FilmError(
+        "undecodable_film", field="film", expected="frames that differ", got=f"{count} equal frames in {path.name}",
+        hint="If it is not a still picture, it is interlaced. Convert it: ffmpeg -i FILM -vf yadif film.mp4",
     )  # fmt: skip

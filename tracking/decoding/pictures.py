@@ -36,7 +36,7 @@ NO_MEMORY = "Error -4 "
 
 
 @contextmanager
-def readable(name: str) -> Iterator[None]:
+def readable(name: str, *, hint: str = "Save it again as PNG or JPEG.") -> Iterator[None]:
     """Convert errors of Pillow, zipfile and decompressors on broken files to `FilmError`, and zlib's lack of memory to `MemoryError`."""
     try:
         with warnings.catch_warnings():
@@ -50,7 +50,7 @@ def readable(name: str) -> Iterator[None]:
         fault = "its format is not recognised" if isinstance(error, UnidentifiedImageError) else error
         raise FilmError(
             "broken_picture", field="film", expected="pictures that can be decoded", got=f"{name}: {fault}",
-            hint="Save it again as PNG or JPEG.",
+            hint=hint,
         ) from error  # fmt: skip
 
 
@@ -105,7 +105,8 @@ def checked(size: tuple[int, int], name: str, limits: FilmLimits) -> tuple[int, 
 
 def gif_frames(path: Path, limits: FilmLimits) -> Iterator[tuple[float, Colour]]:
     """Yield the frames of a GIF as time in seconds and picture."""
-    with readable(path.name), Image.open(path, formats=("GIF",)) as film:
+    hint = "Copy it again, or convert the frames that it has: ffmpeg -i FILM film.mp4"
+    with readable(path.name, hint=hint), Image.open(path, formats=("GIF",)) as film:
         checked(film.size, path.name, limits)
         time, index = 0.0, 0
         while True:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import zipfile
 from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 from pliant.solver.gallery import Sequence
 from pliant.tracking import TrackedFilm
 from pliant.tracking.rendering import RenderedFilm, render_film
@@ -67,6 +69,13 @@ def zip_of(path: Path, entries: dict[str, bytes], compression: int = zipfile.ZIP
 
 def png(picture: np.ndarray) -> bytes:
     return cv2.imencode(".png", picture[..., ::-1])[1].tobytes()
+
+
+def gif(pictures: list[np.ndarray]) -> bytes:
+    buffer = io.BytesIO()
+    first, *others = [Image.fromarray(picture).quantize(64) for picture in pictures]
+    first.save(buffer, "GIF", save_all=True, append_images=others)
+    return buffer.getvalue()
 
 
 def box(kind: bytes, *parts: bytes) -> bytes:
