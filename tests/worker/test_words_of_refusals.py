@@ -20,6 +20,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
+import scipy.sparse
 from crafting import (
     HONEST,
     Runs,
@@ -68,10 +69,16 @@ def npz(**arrays: Any) -> bytes:
     return buffer.getvalue()
 
 
-def mat(**arrays: Any) -> bytes:
+def mat(version: str = "5", **arrays: Any) -> bytes:
     buffer = io.BytesIO()
-    scipy.io.savemat(buffer, arrays)
+    scipy.io.savemat(buffer, arrays, format=version)
     return buffer.getvalue()
+
+
+def hdf5_sparse(file: h5py.File) -> None:
+    group = file.create_group("W")
+    group.attrs["MATLAB_sparse"] = np.uint64(12)
+    group["data"], group["ir"], group["jc"] = WALK.ravel(), np.tile(np.arange(12), 20), np.arange(21) * 12
 
 
 def film(**changes: Any) -> bytes:
@@ -208,11 +215,25 @@ CASES: dict[str, Case] = {
     "fewer bytes in a member": Case(tracks=lambda: archive(("tracks.npy", header(described("(6, 20, 2)"), bytes(64)))),
         words="tracks.tracks: expected a complete, consistent file, got a header that declares 1,920 bytes before 64 bytes of data. Write the file again."),
     "a MATLAB file without a matrix": Case(tracks=lambda: mat(name="text"),
-        words="tracks: expected a numeric matrix such as W, got name (1,). Save the 2F × P matrix: save('tracks.mat', 'W', '-v7')."),
+        words="tracks: expected a full matrix of real numbers, such as W, got char name (1,). Save the 2F × P matrix, a sparse one after W = full(W): save('tracks.mat', 'W', '-v7')."),
     "a MATLAB file that is cut off": Case(tracks=lambda: mat(W=np.ones((12, 20)))[:300],
         words="tracks: expected a complete, consistent file, got a .mat file that cannot be read (…). Write the file again."),
     "HDF5 without a matrix": Case(tracks=lambda: hdf5(lambda file: file.create_group("g")),
-        words="tracks: expected a numeric matrix such as W, got g. Save the 2F × P matrix: save('tracks.mat', 'W', '-v7')."),
+        words="tracks: expected a full matrix of real numbers, such as W, got g. Save the 2F × P matrix, a sparse one after W = full(W): save('tracks.mat', 'W', '-v7')."),
+    "a sparse MATLAB matrix": Case(tracks=lambda: mat(W=scipy.sparse.csc_array(WALK.reshape(12, 20))),
+        words="tracks: expected a full matrix of real numbers, such as W, got sparse W (12, 20). Save the 2F × P matrix, a sparse one after W = full(W): save('tracks.mat', 'W', '-v7')."),
+    "a sparse MATLAB 7.3 matrix": Case(tracks=lambda: hdf5(hdf5_sparse),
+        words="tracks: expected a full matrix of real numbers, such as W, got sparse W. Save the 2F × P matrix, a sparse one after W = full(W): save('tracks.mat', 'W', '-v7')."),
+    "a MATLAB 4 file": Case(tracks=lambda: mat(version="4", W=WALK.reshape(12, 20)),
+        words="tracks: expected npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe exports, recognised by content, got a MATLAB file of version 4. Save it in MATLAB's version 7, e.g. save('tracks.mat', 'W', '-v7')."),
+    "a file of Octave": Case(tracks=lambda: b"# Created by Octave 8.4.0, Mon Jan 01 00:00:00 2024 UTC <a@b>\n# name: W\n",
+        words="tracks: expected npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe exports, recognised by content, got a file in Octave's own format. Save it in MATLAB's version 7, e.g. save('tracks.mat', 'W', '-v7')."),
+    "a MATLAB file as a mesh": Case(mesh=lambda: mat(faces=np.array([[1, 2, 3]])),
+        words="mesh: expected npz, npy, OBJ, PLY, glTF, GLB or a PNG mask, recognised by content, got a MATLAB file. Convert it, e.g. numpy.savez('mesh.npz', faces=faces), with indices from 0."),
+    "an HDF5 file as a mesh": Case(mesh=lambda: hdf5(lambda file: file.create_dataset("faces", data=np.array([[0, 1, 2]]))),
+        words="mesh: expected npz, npy, OBJ, PLY, glTF, GLB or a PNG mask, recognised by content, got an HDF5 file. Convert it, e.g. numpy.savez('mesh.npz', faces=faces), with indices from 0."),
+    "bytes as ground truth": Case(ground_truth=lambda: bytes(range(200, 232)),
+        words="ground_truth: expected npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe exports, recognised by content, got a file of an unknown kind, which begins with the bytes c8 c9 ca cb cc cd ce cf. Convert it, e.g. numpy.savez('truth.npz', shapes=shapes)."),
     "HDF5 noise": Case(tracks=lambda: b"\x89HDF\r\n\x1a\n" + bytes(4000),
         words="tracks: expected a complete, consistent file, got an HDF5 file that cannot be read (…). Write the file again."),
     "HDF5 with a link": Case(tracks=lambda: hdf5(lambda file: file.__setitem__("W", h5py.SoftLink("/x"))),
@@ -269,6 +290,10 @@ CASES: dict[str, Case] = {
         words="tracks.visibility: expected bool, probabilities from 0 to 1, or logits of both signs, got values from 0.5 to 3. Set the option visibility, or convert the array to bool."),
     "visibility above 1": Case(tracks=lambda: npz(tracks=WALK, visibility=np.linspace(0.5, 3, 120).reshape(6, 20)), options={"visibility": "probability"},
         words="tracks.visibility: expected probabilities from 0 to 1, got values from 0.5 to 3. Set the option visibility to bool or logits."),
+    "one frame": Case(tracks=lambda: npy(WALK[:1]),
+        words="tracks: expected at least 3 frames, got 1. Track a longer clip."),
+    "one frame of all pixels": Case(tracks=lambda: npz(tracks=WALK[:1].reshape(1, 1, 4, 5, 2)),
+        words="tracks: expected at least 3 frames, got 1. Track a longer clip."),
     "two frames": Case(tracks=lambda: npy(WALK[:2]),
         words="tracks: expected at least 3 frames, got 2. Track a longer clip."),
     "two points as a matrix": Case(tracks=lambda: npy(np.random.default_rng(0).normal(size=(280, 2))),
@@ -321,6 +346,12 @@ CASES: dict[str, Case] = {
         words="mesh: expected a complete, consistent file, got line 21, which is longer than 4,096 bytes or not text. Write the file again."),
     "an OBJ beyond the limit": Case(mesh=lambda: b"v 0 0 0\n" * 30, limits=Limits(max_points=25),
         words="mesh: expected at most 25 vertices and 4,000,000 faces, got more. Reduce the input, e.g. fewer frames or points, or ask the operator to raise the limit."),
+    "an OBJ that counts from 0": Case(mesh=lambda: (PLACES + "f 0 1 2\n").encode(),
+        words="mesh.faces: expected indices from 1 to 20, the vertices of the OBJ, got indices from 0 to 2. The first vertex of an OBJ has index 1."),
+    "an OBJ face beyond its vertices": Case(mesh=lambda: (PLACES + "f 1 2 21\n").encode(),
+        words="mesh.faces: expected indices from 1 to 20, the vertices of the OBJ, got indices from 1 to 21. The first vertex of an OBJ has index 1."),
+    "an OBJ face that repeats a vertex": Case(mesh=lambda: (PLACES + "f 1 2 3\nf 4 5 5\n").encode(),
+        words="mesh.faces: expected distinct vertices in every face, got f 4 5 5. Remove faces that repeat a vertex."),
     "an OBJ face beyond 64 bits": Case(mesh=lambda: (PLACES + f"f 1 2 {10**30}\n").encode(),
         words="mesh.faces: expected a complete, consistent file, got an index beyond 64 bits. Write the file again."),
     "a face of two vertices": Case(mesh=lambda: (PLACES + "f 1 2\n").encode(),
@@ -339,8 +370,10 @@ CASES: dict[str, Case] = {
         words="mesh: expected plain accessors, got sparse or compressed data. Export without compression, or as OBJ or PLY."),
     "a glTF of nothing": Case(mesh=lambda: b'{"asset": {"version": "2.0"}}',
         words="mesh: expected a complete, consistent file, got a glTF that cannot be read (no entry 'meshes'). Write the file again."),
+    "a glTF of compressed views": Case(mesh=lambda: glb(gltf(bufferViews=[{"buffer": 0, "byteLength": 240, "extensions": {"EXT_meshopt_compression": {}}}] * 2), bytes(264)),
+        words="mesh: expected plain accessors, got sparse or compressed data. Export without compression, or as OBJ or PLY."),
     "a glTF of another file": Case(mesh=lambda: json.dumps(gltf(buffers=[{"byteLength": 264, "uri": "data.bin"}])).encode(),
-        words="mesh: expected a complete, consistent file, got a glTF that cannot be read (a buffer in another file). Write the file again."),
+        words="mesh: expected data inside the file itself, got a buffer in another file. Export a binary glTF (.glb), or one with embedded data."),
     "a glTF beyond its buffer": Case(mesh=lambda: glb(gltf(), bytes(100)),
         words="mesh: expected a complete, consistent file, got a glTF that cannot be read (an accessor beyond its buffer). Write the file again."),
     "a glTF of absurd counts": Case(mesh=lambda: glb(gltf(accessors=accessors(count=10**12)), bytes(264)),

@@ -3,9 +3,9 @@
     pliant.solver.InvalidInput      base: every error has code, field, expected, got and hint
     └── AmbiguousInput              several interpretations fit; lists them as choices
 
-Codes of this package: ambiguous_coordinates, ambiguous_layout, damaged_file, duplicate_member, duplicate_observation, empty_file,
-member_name, missing_array, missing_image_size, no_frames_left, object_array, out_of_range, pickle_refused, too_large, too_slow,
-transposed_grid, unknown_format, unsupported_feature, vertex_count_mismatch, wrong_shape, wrong_type.
+Codes of this package: ambiguous_coordinates, ambiguous_layout, damaged_file, degenerate_face, duplicate_member, duplicate_observation,
+empty_file, index_out_of_range, member_name, missing_array, missing_image_size, no_frames_left, object_array, out_of_range, pickle_refused,
+too_large, too_slow, transposed_grid, unknown_format, unsupported_feature, vertex_count_mismatch, wrong_shape, wrong_type.
 """
 
 from __future__ import annotations
@@ -14,6 +14,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from pliant.solver import InvalidInput
+
+FULL = "a full matrix of real numbers, such as W"
+SAVE_MATRIX = "Save the 2F × P matrix, a sparse one after W = full(W): save('tracks.mat', 'W', '-v7')."
+"""What files of MATLAB must hold, and how to write them."""
 
 LISTED, LONGEST_NAME = 10, 40
 """Numbers of arrays that an error lists, and of characters of each name."""

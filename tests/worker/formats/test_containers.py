@@ -48,6 +48,7 @@ def test_matlab_structs_of_both_versions_give_the_same_tracks(tmp_path: Path) ->
     scipy.io.savemat(tmp_path / "five.mat", {"data": {"W": MATRIX}})
     with h5py.File(tmp_path / "seven.mat", "w", userblock_size=512) as file:
         file["data/W"] = MATRIX.T
+        file["data/W"].attrs["MATLAB_class"] = np.bytes_("double")
     for name in ("five.mat", "seven.mat"):
         np.testing.assert_array_equal(read(tmp_path / name).tracks.points, POINTS)
 
@@ -57,10 +58,18 @@ def test_other_variables_of_a_file_may_have_any_name_and_number(tmp_path: Path) 
     scipy.io.savemat(tmp_path / "five.mat", {"W": MATRIX, "file": np.ones(3), "allow_pickle": np.ones(3)})
     with h5py.File(tmp_path / "seven.mat", "w") as file:
         file["Größe (mm)/W"] = MATRIX.T
+        file["Größe (mm)/W"].attrs["MATLAB_class"] = np.bytes_("double")
         for index in range(Limits().max_members):
             file[f"v{index}"] = np.ones(3)
     for name in ("five.mat", "seven.mat"):
         np.testing.assert_array_equal(read(tmp_path / name).tracks.points, POINTS)
+
+
+@forked
+def test_a_table_of_numpy_savetxt_is_read(tmp_path: Path) -> None:
+    rows = [(f, p, x, y) for f in range(F) for p, (x, y) in enumerate(POINTS[f].tolist())]
+    np.savetxt(tmp_path / "t.csv", rows, delimiter=",", header="frame,point,x,y")
+    np.testing.assert_array_equal(read(tmp_path / "t.csv").tracks.points, POINTS)
 
 
 @forked

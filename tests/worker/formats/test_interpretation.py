@@ -211,6 +211,26 @@ def test_matlab_73_ignores_text_and_empty_arrays_and_limits_cells(tmp_path: Path
         read_matlab73(stream, field="tracks", limits=Limits())
 
 
+def test_hdf5_of_other_programs_keeps_its_axes(tmp_path: Path) -> None:
+    rows = np.arange(P) / P * 300  # neighbouring points are as close as neighbouring frames
+    points = POINTS + np.stack([rows, np.sqrt(rows)], axis=1)
+    with h5py.File(tmp_path / "t.h5", "w") as file:
+        file["tracks"], file["visibility"] = points, np.ones((F, P), dtype=bool)
+    got = read_inputs(tracks=tmp_path / "t.h5", mesh="none", options=Options())
+    np.testing.assert_array_equal(got.tracks.points, points)
+
+
+@pytest.mark.parametrize("axes", [(2, 1, 0), (0, 2, 1)])
+def test_the_order_of_other_axes_than_the_documented_ones_is_not_guessed(axes: tuple[int, ...]) -> None:
+    """With x and y on another axis than the last, frames before points is no more probable than points before frames."""
+    angles = (
+        (np.arange(12)[:, None] + np.arange(40)) * np.pi / 6
+    )  # a step in time is as long as the distance of neighbours
+    points = 300 + 100 * np.stack([np.cos(angles), np.sin(angles)], axis=2)
+    wrong = refused("ambiguous_layout", {"tracks": points.transpose(axes)})
+    assert {str(way["layout"]) for way in offered(wrong)} == {"frames_points", "points_frames"}
+
+
 def test_tracks_of_all_pixels_give_a_grid_mesh(tmp_path: Path) -> None:
     np.savez(tmp_path / "t.npz", tracks=pixels(POINTS), visibility=pixels(SEEN))
     got = read_inputs(tracks=tmp_path / "t.npz", options=Options())

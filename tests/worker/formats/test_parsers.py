@@ -58,7 +58,7 @@ LIST = PLY_FACE.replace("vertex_indices", "others")
         (read_glb, glb(gltf(accessors=accessors(sparse={})), BINARY), Limits(), "unsupported_feature"),
         (read_glb, glb(gltf(accessors=accessors(count=10**18)), BINARY), Limits(), "too_large"),
         (read_glb, glb(gltf(), BINARY[:100]), Limits(), "damaged_file"),
-        (read_glb, glb(gltf(buffers=[{"uri": "mesh.bin"}])), Limits(), "damaged_file"),
+        (read_glb, glb(gltf(buffers=[{"uri": "mesh.bin"}])), Limits(), "unsupported_feature"),
         (read_obj, OBJ_POINTS.encode(), FEW, "too_large"),
         (read_obj, b"# a comment\n", Limits(), "unknown_format"),
         (read_ply, ply(PLY_VERTEX, bytes(240)), FEW, "too_large"),

@@ -133,6 +133,17 @@ def test_unicode_text_of_a_spreadsheet_is_read(mark: bytes, encoding: str, tmp_p
     np.testing.assert_allclose(read.tracks.points[SURE > 0.5], POINTS[SURE > 0.5])
 
 
+@pytest.mark.parametrize("numbered", [True, False])
+def test_rows_with_frame_numbers_may_come_in_any_order(numbered: bool, tmp_path: Path) -> None:
+    head, *rows = one_row_a_frame(",", ".").split("\n")
+    if not numbered:  # words in place of numbers say nothing about the order
+        rows = [f"picture{row}" for row in rows]
+    (tmp_path / "tracks.csv").write_text("\n".join([head, *rows[::-1]]))
+    read = read_inputs(tracks=tmp_path / "tracks.csv", mesh="none", options=Options())
+    order = slice(None, None, 1 if numbered else -1)
+    np.testing.assert_allclose(read.tracks.points[SURE[order] > 0.5], POINTS[order][SURE[order] > 0.5])
+
+
 def test_mediapipe_landmarks_are_fractions_of_the_picture(tmp_path: Path) -> None:
     places = np.random.default_rng(0).uniform(0.2, 0.8, (1, 33, 4)) + np.arange(F)[:, None, None] * 0.01
     head = ",".join(f"{axis}{index}" for index in range(33) for axis in ("x", "y", "z", "v"))
@@ -304,6 +315,10 @@ REFUSED: dict[str, tuple[bytes, str, str]] = {
     "decimal commas between commas": (b"frame,point,x,y\n0,0,1,5,2,5\n", "unreadable_table", f"{TABLE} 2: '0,0,1,5,2,5'. {EXAMPLE}"),
     "one row a frame without names": (
         b"0,1,2,3,4,5,6,7,8\n1,2,3,4,5,6,7,8,9\n", "unreadable_table", f"{TABLE} 1: '0,1,2,3,4,5,6,7,8'. {EXAMPLE}",
+    ),
+    "one frame twice": (
+        b"frame,x0,y0,x1,y1\n0,1,2,3,4\n1,1,2,3,4\n1,1,2,3,4\n", "duplicate_observation",
+        "tracks: expected one row for each frame, got frame 1 twice. Keep one row for each frame, with the columns of all points.",
     ),
     "a short row": (b"x0,y0,x1,y1\n1,2,3,4\n1,2,3\n", "unreadable_table", f"{TABLE} 3: '1,2,3'. {EXAMPLE}"),
     "half of DeepLabCut's head": (b"scorer,a,a,a\nbodyparts,b,b,b\n0,1,2,3\n", "unreadable_table", f"{TABLE} 1: 'scorer,a,a,a'. {EXAMPLE}"),

@@ -124,6 +124,23 @@ def test_a_grid_with_holes_keeps_its_holes(folder: Path) -> None:
     assert got.mesh.num_points == int(mask[::2, ::2].sum())
 
 
+def test_every_point_kept_of_a_ragged_surface_belongs_to_a_face(folder: Path) -> None:
+    """Programs drop points without a face when they import a mesh; point p would no longer be vertex p."""
+    row, column = np.mgrid[:ROWS, :COLUMNS]
+    mask = (abs(row - ROWS / 2) / ROWS + abs(column - COLUMNS / 2) / COLUMNS < 0.5) | (row == 2)
+    numbered = np.full(mask.shape, -1)
+    numbered[mask] = np.arange(mask.sum())
+    points = POINTS[:, mask.ravel()]
+    grid = Mesh.from_grid(numbered)
+    for mesh in (grid, Mesh.from_faces(grid.faces, grid.num_points)):
+        for limit in range(10, int(mask.sum()), 7):
+            kept, thinned, notes = thin(points, None, mesh, Options(max_points=limit))
+            assert thinned is not None
+            np.testing.assert_array_equal(np.unique(thinned.faces), np.arange(len(kept)))
+            assert thinned.num_points == len(kept) <= limit
+            assert not any("belong to no face" in note for note in notes)
+
+
 @pytest.mark.parametrize("how", [{"stride": 6}, {"max_points": P // 6}], ids=str)
 def test_a_mesh_is_decimated_evenly_and_stays_connected(folder: Path, how: dict[str, int]) -> None:
     got = read(folder, folder / "quads.npz", **how)

@@ -74,6 +74,7 @@ def _read(lines: Iterator[str], *, field: str, limits: Limits) -> Arrays | tuple
     first, before = next(lines, ""), 1
     while first and not first.strip(SEPARATORS + " \r\n"):
         first, before = next(lines, ""), before + 1
+    first = first.removeprefix("#")  # which numpy.savetxt writes before its header
     wide = _wide(first, lines, field=field, limits=limits, before=before)
     return _columns(first, lines, field=field, limits=limits, before=before) if wide is None else wide
 

@@ -90,12 +90,12 @@ def _mesh(text: bytes, binary: bytes, field: str, limits: Limits) -> Arrays:
 
 def _accessor(document: dict[str, Any], binary: bytes, index: int, field: str, limits: Limits) -> NDArray[np.generic]:
     described = document["accessors"][index]
-    if "sparse" in described or "bufferView" not in described:
+    view = document["bufferViews"][described["bufferView"]] if "bufferView" in described else None
+    if "sparse" in described or view is None or "extensions" in view:  # extensions compress the data
         raise InvalidInput(
             "unsupported_feature", field=field, expected="plain accessors", got="sparse or compressed data",
             hint="Export without compression, or as OBJ or PLY.",
         )  # fmt: skip
-    view = document["bufferViews"][described["bufferView"]]
     dtype, width, count = (
         np.dtype(TYPES[described["componentType"]]),
         WIDTHS[described["type"]],
@@ -106,7 +106,7 @@ def _accessor(document: dict[str, Any], binary: bytes, index: int, field: str, l
     start = _whole(view.get("byteOffset", 0)) + _whole(described.get("byteOffset", 0))
     if not (0 < count <= 3 * limits.max_faces and size <= stride <= 252 + size and start >= 0):
         raise too_large(field, expected="counts within the limits", got=f"{count:,} rows of {stride} bytes")
-    raw = np.frombuffer(_buffer(document, binary, _whole(view["buffer"])), np.uint8)
+    raw = np.frombuffer(_buffer(document, binary, _whole(view["buffer"]), field), np.uint8)
     if start + (count - 1) * stride + size > len(raw):
         raise ValueError("an accessor beyond its buffer")
     rows = np.lib.stride_tricks.as_strided(raw[start:], (count, size), (stride, 1), writeable=False)
@@ -119,11 +119,14 @@ def _whole(value: object) -> int:
     return value
 
 
-def _buffer(document: dict[str, Any], binary: bytes, index: int) -> bytes:
+def _buffer(document: dict[str, Any], binary: bytes, index: int, field: str) -> bytes:
     uri = document["buffers"][index].get("uri")
     if uri is None:
         return binary
     kind, _, encoded = str(uri).partition(";base64,")
     if not kind.startswith("data:") or not encoded:
-        raise ValueError("a buffer in another file")
+        raise InvalidInput(
+            "unsupported_feature", field=field, expected="data inside the file itself", got="a buffer in another file",
+            hint="Export a binary glTF (.glb), or one with embedded data.",
+        )  # fmt: skip
     return base64.b64decode(encoded, validate=True)

@@ -1,8 +1,9 @@
-"""MATLAB .mat files of version 7.3, which are HDF5. Only plain data sets inside the file itself are read.
+"""MATLAB .mat files of version 7.3, which are HDF5, and HDF5 of other programs. Only plain data sets inside the file itself are read.
 
 HDF5 can refer to other files (external storage, virtual data sets, external links) and can declare terabytes in a kilobyte. Both are
-rejected before a value is read. MATLAB stores columns first, so the axes in HDF5 are reversed, and are reversed back here. Cells and the
-fields of struct arrays are references to data sets of the same file, which are followed one step.
+rejected before a value is read. MATLAB stores columns first, so the axes in HDF5 are reversed, and are reversed back here; those of other
+programs, whose data sets lack MATLAB's attribute, are left as they are. Cells and the fields of struct arrays are references to data sets
+of the same file, which are followed one step.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import h5py
 import numpy as np
 from pliant.solver import InvalidInput
-from pliant.worker.formats.errors import missing_array, too_large
+from pliant.worker.formats.errors import FULL, SAVE_MATRIX, missing_array, too_large
 from pliant.worker.formats.point_names import one_line
 from pliant.worker.formats.records import Arrays, Limits
 
@@ -25,6 +26,9 @@ SMALL = 16 << 20
 
 CHUNK_EXCESS = 4
 """Maximum size of a chunk relative to its data set: writers round chunks up along every axis."""
+
+CLASS, SPARSE = "MATLAB_class", "MATLAB_sparse"
+"""Attributes that MATLAB gives to its data sets, and to the groups of sparse matrices."""
 
 MAX_OBJECTS = 512
 MAX_DEPTH = 4
@@ -42,11 +46,12 @@ def read_arrays(file: h5py.File, *, field: str, limits: Limits) -> Arrays:
     found: Arrays = {}
     _collect(file, "", found, field=field, limits=limits, depth=0)
     if not found:
-        there = {one_line(name): getattr(file[name], "shape", None) for name in file if not name.startswith("#")}
-        raise missing_array(
-            field, expected="a numeric matrix such as W", there=there,
-            hint="Save the 2F × P matrix: save('tracks.mat', 'W', '-v7').",
-        )  # fmt: skip
+        there = {
+            ("sparse " if SPARSE in file[name].attrs else "") + one_line(name): getattr(file[name], "shape", None)
+            for name in file
+            if not name.startswith("#")
+        }
+        raise missing_array(field, expected=FULL, there=there, hint=SAVE_MATRIX)
     return found
 
 
@@ -59,10 +64,13 @@ def _collect(group: h5py.Group, prefix: str, found: Arrays, *, field: str, limit
         if not isinstance(group.get(name, getlink=True), h5py.HardLink):
             raise _elsewhere(field, f"{prefix}{name}, a soft or external link")
         item = group[name]
+        if isinstance(item, h5py.Group) and SPARSE in item.attrs:
+            continue
         if isinstance(item, h5py.Group):
             _collect(item, f"{prefix}{name}.", found, field=field, limits=limits, depth=depth + 1)
         elif isinstance(item, h5py.Dataset) and _is_numeric(item):
-            found[f"{prefix}{name}"] = read_values(item, f"{prefix}{name}", _bytes(found), field, limits)
+            values = read_values(item, f"{prefix}{name}", _bytes(found), field, limits)
+            found[f"{prefix}{name}"] = values if CLASS in item.attrs else values.T
         elif isinstance(item, h5py.Dataset) and h5py.check_ref_dtype(item.dtype) is h5py.Reference and item.size:
             stacked = _cells(item, f"{prefix}{name}", _bytes(found), field, limits)
             if stacked is not None:
@@ -71,7 +79,7 @@ def _collect(group: h5py.Group, prefix: str, found: Arrays, *, field: str, limit
 
 def _is_numeric(item: h5py.Dataset) -> bool:
     """Return whether a data set is a non-empty numeric or logical array in MATLAB."""
-    kind = item.attrs.get("MATLAB_class", b"double")
+    kind = item.attrs.get(CLASS, b"double")
     return item.dtype.kind in "fiub" and bool(item.size) and kind != b"char" and "MATLAB_empty" not in item.attrs
 
 

@@ -13,7 +13,7 @@ from typing import IO
 import numpy as np
 import scipy.io
 from numpy.typing import NDArray
-from pliant.worker.formats.errors import damaged, missing_array, too_large
+from pliant.worker.formats.errors import FULL, SAVE_MATRIX, damaged, missing_array, too_large
 from pliant.worker.formats.point_names import one_line
 from pliant.worker.formats.records import Arrays, Limits
 
@@ -57,8 +57,8 @@ def read_matlab5(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
             _collect(name, value, found, 0)
     if not found:
         raise missing_array(
-            field, expected="a numeric matrix such as W", there={one_line(str(name)): tuple(shape) for name, shape, _ in listed},
-            hint="Save the 2F × P matrix: save('tracks.mat', 'W', '-v7').",
+            field, expected=FULL, there={f"{kind} {one_line(str(name))}": tuple(shape) for name, shape, kind in listed},
+            hint=SAVE_MATRIX,
         )  # fmt: skip
     return found
 

@@ -29,7 +29,7 @@ def read_obj(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     Raises
     ------
     InvalidInput
-        Codes damaged_file, unknown_format, too_large, wrong_shape.
+        Codes damaged_file, degenerate_face, index_out_of_range, unknown_format, too_large, wrong_shape.
     """
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
@@ -63,7 +63,25 @@ def read_obj(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
         )
     if any(len(vertex) != 3 for vertex in vertices):
         raise damaged(field, "a vertex without three coordinates")
-    return {"vertices": np.array(vertices, dtype=np.float64), "faces": join_polygons(polygons, field=field)}
+    faces = join_polygons(polygons, field=field)
+    _check_obj_faces(faces, len(vertices), field)
+    return {"vertices": np.array(vertices, dtype=np.float64), "faces": faces}
+
+
+def _check_obj_faces(faces: NDArray[np.int64], count: int, field: str) -> None:
+    """Check the indices as `Mesh` does, but state them as the file does, from 1."""
+    if faces.size and not (faces.min() >= 0 and faces.max() < count):
+        raise InvalidInput(
+            "index_out_of_range", field=f"{field}.faces", expected=f"indices from 1 to {count}, the vertices of the OBJ",
+            got=f"indices from {faces.min() + 1} to {faces.max() + 1}", hint="The first vertex of an OBJ has index 1.",
+        )  # fmt: skip
+    ordered = np.sort(faces, axis=1)
+    repeated = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
+    if len(repeated):
+        raise InvalidInput(
+            "degenerate_face", field=f"{field}.faces", expected="distinct vertices in every face",
+            got="f " + " ".join(str(index + 1) for index in faces[repeated[0]]), hint="Remove faces that repeat a vertex.",
+        )  # fmt: skip
 
 
 def read_ply(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -57,8 +58,18 @@ DOCUMENTS = {
     b"%PDF": "a PDF document", b"PK\x03\x04": "a zip archive", OFFICE: "an Office document (xls, doc)",
     b"\x1f\x8b": "a gzip archive", b"7z\xbc\xaf": "a 7z archive", b"Rar!": "a RAR archive", b"\xfd7zXZ": "an xz archive",
     b"ID3": "a sound recording (mp3)", b"\0asm": "a program", b"\x7fELF": "a program", b"MZ": "a program",
-    b"SQLite format 3": "an SQLite database",
+    b"SQLite format 3": "an SQLite database", HDF5: "an HDF5 file",
 }  # fmt: skip
+VERSION_4 = {1000 * order + 10 * numbers + matrix for order in range(5) for numbers in range(6) for matrix in range(3)}
+"""Kinds of matrices in MATLAB files of version 4."""
+OCTAVE = (b"# Created by Octave", b"Octave-1-")
+EXAMPLES = {
+    "tracks": "numpy.savez('tracks.npz', tracks=points, visibility=visible)",
+    "mesh": "numpy.savez('mesh.npz', faces=faces), with indices from 0",
+    "ground_truth": "numpy.savez('truth.npz', shapes=shapes)",
+    "rotations": "numpy.savez('rotations.npz', rotations=rotations)",
+}
+"""How to write a file for each field."""
 PICKLE = tuple(bytes([0x80, version]) for version in range(2, 6))
 
 
@@ -76,9 +87,9 @@ def recognise(head: bytes, field: str) -> str:
         _refuse_pictures(head)
     starts = {MATLAB_5: "matlab5", b"ply\n": "ply", b"ply\r": "ply", b"glTF": "glb", b"\x89PNG\r\n": "png"}
     for start, name in starts.items():
-        if head.startswith(start):
+        if head.startswith(start) and not (field == "mesh" and name == "matlab5"):
             return name
-    if head.startswith(HDF5) or head[512:].startswith(HDF5):
+    if field != "mesh" and (head.startswith(HDF5) or head[512:].startswith(HDF5)):
         return "matlab73"
     if _is_text(head):
         if field == "mesh":
@@ -108,11 +119,32 @@ def unknown_format(field: str, head: bytes) -> InvalidInput:
     """Return the error for a file of an unknown format."""
     if head.startswith(OFFICE):
         return spreadsheet_refusal(field, DOCUMENTS[OFFICE])
-    kinds = MESH_FILES if field == "mesh" else TRACK_FILES
+    kinds, example = MESH_FILES if field == "mesh" else TRACK_FILES, EXAMPLES.get(field, EXAMPLES["tracks"])
+    matlab = _matlab_kind(head)
+    hint = f"Convert it, e.g. {example}."
+    if matlab is not None and field != "mesh":
+        hint = "Save it in MATLAB's version 7, e.g. save('tracks.mat', 'W', '-v7')."
     return InvalidInput(
-            "unknown_format", field=field, expected=f"{kinds}, recognised by content", got=_in_words(head),
-        hint="Convert it, e.g. numpy.savez('tracks.npz', tracks=points, visibility=visible).",
+        "unknown_format", field=field, expected=f"{kinds}, recognised by content", got=matlab or _in_words(head), hint=hint,
     )  # fmt: skip
+
+
+def _matlab_kind(head: bytes) -> str | None:
+    """Return the kind of file of MATLAB or Octave; None if it is none.
+
+    Version 4 has no signature. It begins with five integers: kind (decimal digits for byte order, 0, numbers and matrix), rows, columns,
+    whether there is an imaginary part, and the length of the name with the zero at its end.
+    """
+    if head.startswith(OCTAVE):
+        return "a file in Octave's own format"
+    if head.startswith(b"MATLAB "):
+        return "a MATLAB file"
+    for order in "<>" if len(head) > 20 else "":
+        kind, _, _, imaginary, length = struct.unpack_from(f"{order}5i", head)
+        name, zero = head[20 : 19 + length], head[19 + length : 20 + length]
+        if kind in VERSION_4 and imaginary in (0, 1) and name.replace(b"_", b"").isalnum() and zero == b"\0":
+            return "a MATLAB file of version 4"
+    return None
 
 
 def _in_words(head: bytes) -> str:

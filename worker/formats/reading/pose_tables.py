@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.point_names import MEDIAPIPE
@@ -47,6 +48,8 @@ class Columns:
     writer: str
     """Name of the track array."""
     names: list[str]
+    frame: int | None = None
+    """The column with the number of the frame."""
 
 
 def separator_of(line: str) -> str:
@@ -114,6 +117,7 @@ def columns_of(heads: list[str]) -> Columns | None:
         confidence,
         "mediapipe" if landmarks else "one_row_a_frame",
         names,
+        next((index for index, head in enumerate(heads) if head.lower() == "frame"), None),
     )
 
 
@@ -142,15 +146,17 @@ def read_rows(
 ) -> Arrays:
     """Read the rows below the header, each of `width` cells; `before` lines were read already.
 
-    Returns the tracks `(F, P, 2)` under the writer's name, NaN where a cell is empty, `likelihood (F, P)` if there are
-    confidences, 1 for points without, and `point_names` if the points have names.
+    If every row has the number of its frame, rows may be in any order; words in that column are ignored. Returns the tracks `(F, P, 2)`
+    under the writer's name, NaN where a cell is empty, `likelihood (F, P)` if there are confidences, 1 for points without, and
+    `point_names` if the points have names.
 
     Raises
     ------
     InvalidInput
-        Codes too_large, unreadable_table.
+        Codes duplicate_observation, too_large, unreadable_table.
     """
     rows: list[list[float]] = []
+    frames: list[float] = []
     seen = {point: column for point, column in enumerate(columns.confidence) if column is not None}
     wanted = [*columns.x, *columns.y, *seen.values()]
     for count, line in enumerate(lines, before + 1):
@@ -165,12 +171,34 @@ def read_rows(
             rows.append([number(row[index], separator) for index in wanted])
         except ValueError:
             raise not_a_table(field, count, line) from None
+        frames.append(np.nan if columns.frame is None else _number_or_nan(row[columns.frame], separator))
         if len(rows) * len(wanted) * 8 > limits.max_bytes:
             raise too_large(field, expected=f"at most {limits.max_bytes:,} bytes as a table", got="more")
     points = len(columns.x)
     table = np.array(rows, dtype=np.float64).reshape(len(rows), len(wanted))
+    if np.isfinite(frames).all():
+        table = table[_in_order(np.array(frames), field)]
     found: Arrays = {columns.writer: np.stack([table[:, :points], table[:, points : 2 * points]], axis=2)}
     if seen:
         found["likelihood"] = np.ones((len(rows), points))
         found["likelihood"][:, list(seen)] = table[:, 2 * points :]
     return {**found, **found_names(columns.names)}
+
+
+def _number_or_nan(cell: str, separator: str) -> float:
+    try:
+        return number(cell, separator)
+    except ValueError:
+        return np.nan
+
+
+def _in_order(frames: NDArray[np.float64], field: str) -> NDArray[np.intp]:
+    """Return the rows in the order of their frames."""
+    order = np.argsort(frames)
+    again = np.flatnonzero(np.diff(frames[order]) == 0)
+    if len(again):
+        raise InvalidInput(
+            "duplicate_observation", field=field, expected="one row for each frame", got=f"frame {frames[order[again[0]]]:g} twice",
+            hint="Keep one row for each frame, with the columns of all points.",
+        )  # fmt: skip
+    return order

@@ -66,7 +66,7 @@ def thin(
 def _thin_grid(grid: NDArray[np.int32], stride: int, limit: int) -> tuple[Indices, Mesh, list[str]]:
     while stride < max(grid.shape) and int((grid[::stride, ::stride] >= 0).sum()) > limit:
         stride += 1
-    coarse = grid[::stride, ::stride]
+    coarse = _without_loose_cells(grid[::stride, ::stride])
     kept = np.sort(coarse[coarse >= 0])
     if len(kept) < MIN_POINTS:
         raise InvalidInput(
@@ -78,6 +78,16 @@ def _thin_grid(grid: NDArray[np.int32], stride: int, limit: int) -> tuple[Indice
     renumbered = np.where(coarse >= 0, numbers[np.maximum(coarse, 0)], -1)
     note = f"{len(kept)} of {len(numbers)} points are used: one in {stride} rows and columns of the grid."
     return kept.astype(np.intp), Mesh.from_grid(renumbered), [note]
+
+
+def _without_loose_cells(grid: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return a grid with holes (−1) for the points that no quad of it contains; unchanged if it has no quads."""
+    corners = (np.s_[:-1, :-1], np.s_[1:, :-1], np.s_[1:, 1:], np.s_[:-1, 1:])
+    whole = np.all([grid[corner] >= 0 for corner in corners], axis=0)
+    inside = np.zeros(grid.shape, dtype=bool)
+    for corner in corners:
+        inside[corner] |= whole
+    return np.where(inside, grid, -1) if whole.any() else grid
 
 
 def _thin_mesh(
@@ -107,8 +117,12 @@ def _thin_mesh(
         & (faces >= 0).all(axis=1)
     )
     _, first = np.unique(np.sort(faces[apart], axis=1), axis=0, return_index=True)
-    coarse = Mesh.from_faces(faces[apart][np.sort(first)].astype(np.int32), len(kept))
-    alone = len(kept) - len(np.unique(coarse.faces))
+    faces = faces[apart][np.sort(first)]
+    inside, renumbered = np.unique(faces, return_inverse=True)
+    if len(inside) >= MIN_POINTS:
+        kept, faces = kept[inside], renumbered.reshape(-1, 3)
+    coarse = Mesh.from_faces(faces.astype(np.int32), len(kept))
+    alone = len(kept) - len(inside)
     notes = [
         f"{len(kept)} of {places.shape[1]} points are used, spread evenly over the mesh; "
         f"{len(mesh.faces)} faces became {len(coarse.faces)}."

@@ -133,7 +133,8 @@ def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: 
         return allowed[0], []
     costs = {one.layout: roughness(one.points) for one in allowed}
     ranked = sorted(allowed, key=lambda one: costs[one.layout])
-    order = None if array.ndim == 3 and dialect.name in OF_ANY_ORDER else dialect.order
+    documented_axes = array.ndim != 3 or (dialect.name not in OF_ANY_ORDER and array.shape[2] == 2)
+    order = dialect.order if documented_axes else None
     documented = [one for one in ranked if order in (None, one.order) or options.layout != "auto"] or ranked
     best, others = documented[0], documented[1:]
     clear = all(costs[other.layout] >= MIN_SMOOTHNESS_RATIO * costs[best.layout] for other in others)

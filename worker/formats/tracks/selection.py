@@ -55,7 +55,7 @@ def hide_sparsely_observed(
     dropped = np.flatnonzero((confidence > 0).sum(axis=0) < options.min_seen)
     if len(dropped) == 0:
         return confidence, dropped, []
-    if len(dropped) == points.shape[1] and confidence.any():
+    if len(dropped) == points.shape[1] and confidence.any() and len(points) >= MIN_FRAMES:
         raise InvalidInput(
             "nothing_visible", field="options.min_seen", expected=f"points that are visible in {options.min_seen} or more frames",
             got=f"none of {len(dropped)}", hint="Set min_seen lower.",
