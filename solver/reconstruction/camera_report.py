@@ -6,9 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 from pliant.solver.cameras.perspective import Perspective
+from pliant.solver.model.marginal_likelihood import UNLIKELY
 from pliant.solver.records import Choices, FocalCandidate
 from pliant.solver.refinement.focal_length import MIN_PERSPECTIVE_GAIN
 from pliant.solver.settings import Settings
+
+DIVERGED = "the depths of the points diverge with it"
+"""Instead of a gain in likelihood, where a focal length has none."""
 
 
 def with_camera_choice(
@@ -62,14 +66,12 @@ def described(view: Perspective, unit: float) -> str:
             f"and frame by {nll[0.0] - nll[best]:+.3f}; more than {MIN_PERSPECTIVE_GAIN} is required, and a clear sign of depth."
         )
     compared = [each for each in nll if each != 0 and (view.given is None or abs(each) == view.given)]
-    gain = nll[0.0] - min((nll[each] for each in compared), default=nll[0.0])
+    own = min((nll[each] for each in compared), default=nll[0.0])
     how = (
         "as given" if view.given is not None else f"± {float(f'{unit * view.curvature_std / view.curvature**2:.2g}'):g}"
     )
-    return (
-        f"Perspective with focal length {unit / abs(view.curvature):.4g} {how}: gains {gain:.3f} in the log likelihood per point and frame "
-        "over orthography."
-    )
+    gains = f"gains {nll[0.0] - own:.3f} in the log likelihood per point and frame over orthography"
+    return f"Perspective with focal length {unit / abs(view.curvature):.4g} {how}: {gains if own < UNLIKELY else DIVERGED}."
 
 
 def improbable(view: Perspective, unit: float) -> str | None:
@@ -82,7 +84,5 @@ def improbable(view: Perspective, unit: float) -> str | None:
     if not np.isfinite(own) or own - nll.get(best, np.inf) <= MIN_PERSPECTIVE_GAIN:
         return None
     other = "orthography" if best == 0 else f"a focal length of {unit / abs(best):.4g}"
-    return (
-        f"The given focal length, {unit / view.given:.4g}, is improbable: {other} gains {own - nll[best]:.3f} in the log likelihood per "
-        "point and frame."
-    )
+    gains = f"{other} gains {own - nll[best]:.3f} in the log likelihood per point and frame"
+    return f"The given focal length, {unit / view.given:.4g}, is improbable: {gains if own < UNLIKELY else DIVERGED}."

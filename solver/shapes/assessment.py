@@ -32,6 +32,7 @@ def assessed(
     *,
     turning: bool,
     seed: int,
+    connected: bool = True,
     changes: Changes | None = None,
     centred: bool = True,
     should_stop: Callable[[], bool] | None = None,
@@ -56,6 +57,8 @@ def assessed(
         Whether the cameras were estimated.
     seed : int
         Seed of the random sample of visibility patterns.
+    connected : bool
+        Whether sparsely observed points were placed on a surface with their neighbours; otherwise only the prior places them.
     changes : Changes, optional
         Jackknife result for these cameras and this covariance; None computes it.
     centred : bool
@@ -76,7 +79,8 @@ def assessed(
         del pinhole
         std *= unit
         tick()
-        std = bounded_by_neighbours(std, solution.shapes, confidence)
+        if connected:
+            std = bounded_by_neighbours(std, solution.shapes, confidence)
         if changes is None:
             changes = learning_changes(estimate, covariance, turning=turning, should_stop=should_stop)
         tick()

@@ -65,19 +65,20 @@ def isometric_solution(
     return Solution(
         shapes, camera, residual, weights, trace, Outcome.STOPPED if stopped else Outcome.CONVERGED, choices, seconds,
         trust=_trust(
-            verdict, camera, shapes, residual=relative, hidden=float((weights == 0).mean()), ordered=settings.order == "film"
+            choices.warnings, camera, shapes,
+            residual=relative, hidden=float((weights == 0).mean()), ordered=settings.order == "film",
         ),
     )  # fmt: skip
 
 
 def _trust(
-    verdict: IsometricVerdict, camera: Camera, shapes: Floats, *, residual: float, hidden: float, ordered: bool
+    warnings: tuple[str, ...], camera: Camera, shapes: Floats, *, residual: float, hidden: float, ordered: bool
 ) -> Trust:
     """Return the verdict without an expected error: isometry is not a Gaussian model, so there is no posterior."""
-    grade = Verdict.WITH_CARE if verdict.warnings else Verdict.GOOD
+    grade = Verdict.WITH_CARE if warnings else Verdict.GOOD
     turning, deforming = per_frame(shapes, camera.rotations) if ordered else (None, None)
     return Trust(
-        grade, verdict.warnings, None, None, turned(camera.rotations), residual, hidden,
+        grade, warnings, None, None, turned(camera.rotations), residual, hidden,
         degrees_per_frame=turning, deformation_per_frame=deforming,
     )  # fmt: skip
 

@@ -11,10 +11,11 @@ image v = w / (1 + κz), relative to the principal point, has the derivative
 
     ∂v/∂x = (s_f R_f[:2] − κ v ⊗ s_f R_f[2]) / (1 + κz),
 
-which replaces Π and differs from point to point; it is evaluated at one representative of each compact part of the object. Visibility
-patterns are evaluated exactly for a sample of points. From these the ratio of the variance of a hidden position to that of a visible one
-is estimated, as a function of the number of frames to the nearest observation; it predicts the variances of all other points. Cameras are
-taken as known, so the standard deviations are lower bounds where few frames or little motion leave the cameras uncertain.
+which replaces Π and differs from point to point; it is evaluated at one representative of each compact part of the object. The variances
+of points that are visible in all frames, or in none, which have the prior's, are exact, and so are those of a sample of the others. From
+this sample, the ratio of the variance of a position to that of a point visible in all frames is estimated, as a function of the number of
+frames to the nearest observation; it predicts the variances of the remaining points. Cameras are taken as known, so the standard deviations
+are lower bounds where few frames or little motion leave the cameras uncertain.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ MAX_OPERATIONS = 2e10
 MAX_PATTERNS = 128
 """Maximum number of patterns evaluated."""
 
-GAPS = (0, 1, 2, 4, 8, 16, 32, np.inf)
+GAPS = (0, 1, 2, 4, 8, 16, 32)
 """Bounds of the classes of positions, in frames to the nearest frame that shows the point."""
 
 
@@ -119,13 +120,13 @@ def position_std(
     nearest, chosen = _representatives(pinhole, used, confidence.shape[1])
     moments = [_moments(covariance, _rows(projections, pinhole, point), used) for point in chosen]
     complete = np.stack([_variance(*each, np.ones(len(used)), noise) for each in moments], axis=1)
-    everything = complete[:, nearest]
-    if (confidence == 1).all():
-        found = everything
-    else:
-        sample = _sample(weights, seed)
-        exact = [_variance(*moments[int(nearest[point])], weights[:, point], noise) for point in sample]
-        found = _predicted(everything, weights, sample, np.stack(exact, axis=1))
+    found, shown = complete[:, nearest], (weights > 0).any(axis=0)
+    found[:, ~shown] = moments[0][0][:, None]
+    partly = np.flatnonzero(shown & (weights != 1).any(axis=0))
+    if len(partly):
+        sample = _sample(weights[:, partly], seed)
+        exact = [_variance(*moments[int(nearest[point])], weights[:, point], noise) for point in partly[sample]]
+        found[:, partly] = _predicted(found[:, partly], weights[:, partly], sample, np.stack(exact, axis=1))
     if len(used) < frames:
         found = between(used, found, frames)
     return np.asarray(np.sqrt(np.maximum(found, 0.0)))

@@ -21,6 +21,7 @@ from pliant.solver.cameras.perspective import (
     posterior_depths,
 )
 from pliant.solver.evaluation.metrics import e3d_frame_scaled, focal_error, reprojection
+from pliant.solver.model.marginal_likelihood import UNLIKELY
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
 from pliant.solver.reconstruction.camera_report import described, improbable
@@ -378,3 +379,13 @@ def test_the_reported_gain_is_that_of_the_given_focal_length() -> None:
     assert "gains 0.100 in" in described(view, 100.0)
     assert "gains 0.400 in" in str(improbable(view, 100.0))
     assert improbable(replace(view, candidates=candidates[:1]), 100.0) is None  # stopped before its own was compared
+
+
+def test_a_given_focal_length_with_which_the_depths_diverge_has_no_figure_in_the_report() -> None:
+    candidates = tuple(Candidate(each, nll) for each, nll in ((-0.1, UNLIKELY), (0.0, 1.0), (0.1, UNLIKELY)))
+    view = Perspective(
+        np.zeros((8, 2)), CENTRE, given=0.1, signs=(1, -1), required=False, curvature=0.1, candidates=candidates
+    )
+    for sentence in (described(view, 100.0), str(improbable(view, 100.0))):
+        assert "the depths of the points diverge" in sentence
+        assert "gains" not in sentence

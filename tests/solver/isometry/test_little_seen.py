@@ -31,6 +31,8 @@ def test_a_frame_that_shows_only_a_line_takes_the_shape_of_the_nearest_frame(sho
     assert one_scale_error(found.shapes[others], sheet.points[others]) < 0.03
     assert one_scale_error(found.shapes, sheet.points) < 0.05
     assert any(warning.startswith("1 of 6 frames show too little") for warning in found.choices.warnings)
+    assert found.trust is not None
+    assert found.trust.reasons == found.choices.warnings
 
 
 @pytest.mark.parametrize(

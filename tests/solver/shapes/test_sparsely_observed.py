@@ -198,6 +198,20 @@ def test_hidden_grid_points_become_a_hole_and_are_filled_in() -> None:
     assert np.linalg.norm((found.shapes - true)[:, hole], axis=2).max() < 0.1 * np.abs(true).max()
 
 
+@pytest.mark.parametrize("mesh", [None, Mesh.from_faces(np.zeros((0, 3), dtype=int), 60)], ids=["no mesh", "no faces"])
+def test_the_std_of_unseen_points_without_a_surface_is_not_bounded_by_their_neighbours(mesh: Mesh | None) -> None:
+    made, unseen = gallery.face(6, 60, degrees=60), [20, 30, 40]
+    visible = np.ones((6, 60))
+    visible[:, unseen] = 0
+    cameras = KnownCamera.from_arrays(made.rotations, made.scales)
+    settings = Settings(camera="scaled_orthographic")
+    found = solve(Tracks.from_arrays(made.tracks.points, visible), mesh, cameras=cameras, settings=settings)
+    assert found.shapes_std is not None
+    true = made.shapes - made.shapes.mean(axis=1, keepdims=True)
+    error = np.linalg.norm((found.shapes - true)[:, unseen], axis=2)
+    assert 0.8 < np.sqrt(np.square(found.shapes_std[:, unseen]).mean() / np.square(error).mean()) < 3
+
+
 @pytest.mark.parametrize(
     ("tracks", "mesh"),
     [

@@ -153,6 +153,20 @@ def test_std_predicted_from_sampled_patterns_is_close_to_exact(monkeypatch: pyte
     assert np.median(np.abs(np.log(predicted / exact))) < 0.2
 
 
+def test_points_visible_in_all_frames_or_in_none_have_the_exact_std_beside_rarely_visible_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given, pairs = covariance(), projections()
+    confidence = np.ones((FRAMES, 60))
+    confidence[:, 20:40], confidence[2:, 40:] = 0.0, 0.0
+    confidence[1, 40::2] = 0.0
+    monkeypatch.setattr(uncertainty, "MAX_PATTERNS", 8)
+    found = position_std(given, pairs, confidence, noise_std=NOISE)
+    always, never = (position_std(given, pairs, np.full((FRAMES, 1), each), noise_std=NOISE) for each in (1.0, 0.0))
+    np.testing.assert_allclose(found[:, :20], np.repeat(always, 20, axis=1), rtol=1e-12)
+    np.testing.assert_allclose(found[:, 20:40], np.repeat(never, 20, axis=1), rtol=1e-12)
+
+
 def test_evaluating_some_frames_of_a_long_film_rarely_understates_the_std(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
