@@ -99,7 +99,7 @@ def demo(
         width, height = scene.size
         out().print(f"Rendering a film of a talking face: {scene.frames} frames of {width}×{height} pixels …")
     film = render(scene, output)
-    with tempfile.TemporaryDirectory(prefix="pliant-demo-") as folder, running(Path(folder)) as url:
+    with ending_in_order(), tempfile.TemporaryDirectory(prefix="pliant-demo-") as folder, running(Path(folder)) as url:
         from pliant.client.progress import progress_bar
 
         with session.client(url, as_json=as_json) as client, progress_bar(line_every=LINE_EVERY) as bar:
@@ -196,6 +196,18 @@ def report(
 
 
 @contextmanager
+def ending_in_order() -> Iterator[None]:
+    """Make SIGTERM and the end of the terminal work like Ctrl-C, so that the service never outlives this process."""
+    numbers = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) != signal.SIG_IGN]  # as nohup
+    handlers = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
 def running(folder: Path) -> Iterator[str]:
     """Run `pliant up` on a free port, with data and log in a folder that is created; yield its address, then stop it.
 
@@ -245,7 +257,7 @@ def announced(stream: IO[str]) -> str | None:
 
 
 def wait_for_interrupt() -> None:
-    """Sleep until Ctrl-C or SIGTERM."""
+    """Sleep until Ctrl-C, SIGTERM or SIGHUP; see `ending_in_order`."""
     try:
         signal.pause()
     except KeyboardInterrupt:

@@ -24,6 +24,7 @@ from pliant.client import BadArgument
 from pliant.schemas.problems import ProblemCode
 from pliant.service.testing import InMemoryService
 from pliant.worker.settings import NUMERICAL_THREADS
+from serving import until
 from typer.testing import CliRunner, Result
 
 Run = Callable[..., Result]
@@ -282,6 +283,24 @@ def test_demo_replaces_files_in_a_named_folder_only_if_forced(
     for more, folder in ((["-o", "mine", "--force"], "mine"), ([], "demo-output"), (["-o", "new"], "new")):
         ran = run("demo", "--json", *more)
         assert json.loads(ran.stderr)["detail"] == f"rendered into {folder}", more
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_demo_ends_with_its_service_when_its_terminal_or_process_is_ended(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    if signal.getsignal(number) == signal.SIG_IGN:
+        pytest.skip("these tests run under nohup")
+    (tmp_path / "tmp").mkdir()
+    environment = {**os.environ, "TMPDIR": str(tmp_path / "tmp")}
+    command = [sys.executable, "-m", "pliant.cli", "demo", "--small", "--json"]
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    ) as demo:
+        until(lambda: list((tmp_path / "tmp").glob("pliant-demo-*/data/*")) != [], seconds=60)
+        demo.send_signal(number)
+        assert demo.wait(60) == Exit.INTERRUPTED
+    assert list((tmp_path / "tmp").glob("pliant-demo-*")) == []  # the service has ended, and its data are removed
 
 
 def test_jobs_can_be_given_by_id_prefix_or_as_the_last_one(run: Run, tracks: Path) -> None:

@@ -351,7 +351,7 @@ def test_a_picture_beside_a_film_is_its_region(
         with filming.expect_file_chooser() as opened:
             filming.get_by_role("button", name="Choose a mask picture").click()
         opened.value.set_files({"name": "mask.png", "mimeType": "image/png", "buffer": mask()})
-    shown = filming.get_by_text("Region: the mask picture mask.png. What is white in it is tracked.")
+    shown = filming.get_by_text("Region of the first frame: the mask picture mask.png. What is white in it is tracked.")
     expect(shown).to_be_visible()
     until(lambda: colour_at_corner(filming)[0] < 140)  # darkened outside the mask
     filming.get_by_role("button", name="Reconstruct").click()
@@ -440,6 +440,27 @@ def test_a_film_job_is_run_again_with_its_region(filming: Page, url: str, finish
     until(lambda: filming.evaluate("window.sent !== undefined"))
     assert sent_options(filming)["region_polygon"] == corners
     assert sent_options(filming)["region_frame"] == 4
+
+
+def test_the_rate_and_size_that_a_film_states_are_not_options_of_the_next_job(
+    filming: Page, url: str, finished: str
+) -> None:
+    """Another choice of frames, or another film, has a rate of its own."""
+    stated = {"fps": 30.000000000000004, "image_size": "320x240"}
+    record = film_record(url, finished, status="succeeded", artifacts=[], sentence="Converged.")
+    record["options"] |= {**stated, "frames": "::2"}
+    record["interpretation"] |= stated
+    answer_with(filming, record)
+    filming.goto(f"{url}/#job={finished}")
+    expect(filming.get_by_role("region", name="Use from code")).to_contain_text('"frames": "::2"')
+    expect(filming.get_by_role("region", name="Use from code")).not_to_contain_text("fps")
+    filming.get_by_role("button", name="More files").click()
+    expect(filming.get_by_label("Frames per second")).to_have_value("30")
+    filming.get_by_role("button", name="Run again with other options").click()
+    filming.get_by_role("button", name="Reconstruct").click()
+    until(lambda: filming.evaluate("window.sent !== undefined"))
+    assert sent_options(filming)["frames"] == "::2"
+    assert not stated.keys() & sent_options(filming).keys()
 
 
 def test_a_region_can_be_drawn_by_touch(filming: Page, films: dict[str, bytes]) -> None:
@@ -553,6 +574,9 @@ def test_a_running_film_job_shows_frame_points_progress_and_time_left(
     left = filming.locator(".figures div", has_text="Time left").locator("dd")
     first = left.inner_text()
     until(lambda: left.inner_text() != first)  # no message arrived: the page counts by itself
+    filming.route(f"**/v1/jobs/{finished}", lambda route: route.abort())
+    expect(left).to_have_text("–")  # the estimate may be outdated
+    expect(filming.get_by_text("Tracking the film.", exact=True)).to_be_visible()
     followed = {"frame": 3, "seconds": 0.6, "width": WIDTH, "height": HEIGHT, "points": [160, 120, 170, 130]}
     moved = {**record["progress"], "followed": followed, "fraction": 0.3, "updated_at": "2099-01-01T00:00:00Z"}
     answer_with(filming, {**record, "progress": moved})

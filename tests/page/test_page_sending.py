@@ -10,7 +10,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from browsing import differing_pixels, why_not
+from browsing import differing_pixels, heard, why_not
 from paging import DONE, TRACKS, choose, drop, packed, seek, until
 from playwright.sync_api import Page, Route, expect
 
@@ -40,6 +40,8 @@ def test_files_are_submitted_and_the_result_plays(page: Page, url: str, small: d
     canvas = page.locator(".view canvas")
     canvas.wait_for(timeout=DONE)
     expect(page.get_by_role("article").get_by_text("Done", exact=True)).to_be_visible()
+    for step in ("More files", "Share", "Run again with other options"):
+        expect(page.get_by_role("button", name=step, exact=True)).to_be_visible()
 
     seek(page, 0)
     first, again = canvas.screenshot(), canvas.screenshot()
@@ -151,6 +153,58 @@ def test_resubmitting_after_a_lost_response_creates_no_second_job(
     expect(page.get_by_role("heading", name="sent twice")).to_be_focused()
     jobs = httpx.get(f"{url}/v1/jobs").json()["jobs"]
     assert len([job for job in jobs if job["name"] == "sent twice"]) == 1
+
+
+def test_a_file_that_is_still_being_read_is_submitted(page: Page, small: dict[str, bytes]) -> None:
+    page.evaluate("""() => {
+      const read = Blob.prototype.arrayBuffer;
+      let waits = 900; // milliseconds: the first file takes longer than the second
+      Blob.prototype.arrayBuffer = async function () {
+        await new Promise((resolve) => setTimeout(resolve, waits));
+        waits = 100;
+        return read.call(this);
+      };
+      const send = XMLHttpRequest.prototype.send;
+      window.sent = [];
+      XMLHttpRequest.prototype.send = function (form) {
+        window.sent.push(form.get("tracks").name);
+        return send.call(this, form);
+      };
+    }""")
+    keys: list[str | None] = []
+
+    def lost(route: Route) -> None:
+        keys.append(route.request.headers.get("idempotency-key"))
+        route.abort()
+
+    page.route("**/v1/jobs", lost)
+    for name in ("first.npz", "second.npz"):
+        file = {"name": name, "mimeType": "application/octet-stream", "buffer": small[TRACKS]}
+        page.get_by_label("Tracks", exact=True).set_input_files(file)  # type: ignore[arg-type]
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.get_by_role("alert")).to_contain_text("then press Reconstruct again; no job is created twice.")
+    page.get_by_label("name (optional)").fill("another")
+    page.get_by_label("name (optional)").fill("second")
+    page.get_by_role("button", name="Reconstruct").click()
+    heard(page, lambda: len(keys) == 2)
+    assert page.evaluate("window.sent") == ["second.npz", "second.npz"]
+    assert keys[0] == keys[1]
+
+
+def test_a_file_changed_since_it_was_chosen_is_named(page: Page, small: dict[str, bytes], tmp_path: Path) -> None:
+    path = tmp_path / "mine.npz"
+    path.write_bytes(small[TRACKS])
+    page.get_by_label("Tracks", exact=True).set_input_files(path)
+    expect(page.get_by_role("region", name="How your files are interpreted")).to_contain_text("10 frames of 300 points")
+    path.write_bytes(small["mesh.npz"])
+    os.utime(path, (1, 1))
+    page.get_by_role("button", name="Reconstruct").click()
+    words = "Not submitted. Changed or deleted since you chose it: mine.npz. Choose it again."
+    expect(page.get_by_text(words)).to_be_visible()
+    path.write_bytes(small[TRACKS])
+    page.get_by_label("Tracks", exact=True).set_input_files(path)
+    expect(page.get_by_role("region", name="How your files are interpreted")).to_contain_text("10 frames of 300 points")
+    expect(page.get_by_text(words)).to_be_hidden()
 
 
 def test_an_ambiguous_input_is_resolved_by_a_click(page: Page, url: str) -> None:

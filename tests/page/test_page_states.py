@@ -128,7 +128,9 @@ def test_missing_locked_and_expired_pages_are_accessible(page: Page, url: str, f
     check("share-ended")
 
 
-def test_the_api_reference_is_accessible(page: Page, url: str, check: Check) -> None:
+def test_the_guide_and_the_api_reference_are_accessible(page: Page, url: str, check: Check) -> None:
+    page.goto(f"{url}/guide")
+    check("guide")
     page.goto(f"{url}/docs")
     page.get_by_role("heading", name="Pliant 0").wait_for()
     # Swagger UI puts a link, one line of text high, inside the button of each operation.

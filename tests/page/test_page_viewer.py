@@ -316,6 +316,11 @@ def test_help_opens_and_closes_by_keyboard(viewer: Page) -> None:
     expect(help_).to_contain_text("Camera's view".lower())
     viewer.keyboard.press("Escape")
     expect(help_).to_have_count(0)
+    viewer.set_viewport_size({"width": 640, "height": 450})  # 1280 × 900 at 200 %
+    canvas(viewer).press("?")
+    expect(help_.get_by_text("Drag, arrow keys")).to_be_in_viewport()
+    viewer.keyboard.press("Escape")
+    expect(help_).to_have_count(0)
 
 
 def test_picture_video_and_offline_page_can_be_saved(viewer: Page, tmp_path: Path) -> None:

@@ -24,20 +24,21 @@ export const AGAIN = "pliant-again";
 
 export class Afterwards {
   readonly element = h("section", { class: "afterwards", "aria-label": "Next steps", hidden: true });
+  private readonly files = button("More files", () => this.toggle("files", this.files), { "aria-expanded": "false" });
+  private readonly share = button("Share", () => this.toggle("share", this.share), { "aria-expanded": "false" });
   private readonly body = h("div", {});
   private shown: "files" | "share" | null = null;
   private job: Job | null = null;
 
+  constructor() {
+    const again = button("Run again with other options", () => document.dispatchEvent(new CustomEvent(AGAIN, { detail: this.job })));
+    this.element.append(h("div", { class: "row" }, this.files, this.share, again), this.body);
+  }
+
   show(job: Job): void {
-    const known = this.job !== null;
     this.job = job;
     this.element.hidden = !isFinal(job.status) || job.outputs_of !== null;
-    if (known && this.element.childElementCount > 0) return;
-    const done = job.status === "succeeded";
-    const again = button("Run again with other options", () => document.dispatchEvent(new CustomEvent(AGAIN, { detail: this.job })));
-    const files = button("More files", () => this.toggle("files", files), { "aria-expanded": "false", hidden: !done });
-    const share = button("Share", () => this.toggle("share", share), { "aria-expanded": "false", hidden: !done });
-    this.element.replaceChildren(h("div", { class: "row" }, files, share, again), this.body);
+    this.files.hidden = this.share.hidden = job.status !== "succeeded";
   }
 
   private toggle(what: "files" | "share", opener: HTMLButtonElement): void {
@@ -60,7 +61,7 @@ function furtherFiles(job: Job): HTMLElement {
     const box = h("input", { type: "checkbox", id, value: kind });
     return { box, label: h("label", { for: id, class: "tick" }, box, ` ${words}`) };
   });
-  const rate = h("input", { type: "number", id: uniqueId("rate"), min: 1, max: 1000, step: "any", value: String(job.options["fps"]) });
+  const rate = h("input", { type: "number", id: uniqueId("rate"), min: 0, max: 1000, step: "any", value: Number(Number(job.options["fps"]).toPrecision(6)) });
   const axes = h(
     "select",
     { id: uniqueId("axes") },
@@ -86,7 +87,7 @@ function furtherFiles(job: Job): HTMLElement {
       return;
     }
     make.disabled = true;
-    void write(job, { outputs, fps: Number(rate.value), axes: axes.value }, words).finally(() => (make.disabled = false));
+    void write(job, { outputs, ...(rate.value !== rate.defaultValue && { fps: Number(rate.value) }), axes: axes.value }, words).finally(() => (make.disabled = false));
   });
   return form;
 }

@@ -52,11 +52,11 @@ export function headers(): Record<string, string> {
   return token ? { Authorization: `Bearer ${token}` } : {};
 }
 
-function unreachable(): Refusal {
+function unreachable(advice = "Check that it is running; this page reconnects automatically."): Refusal {
   return new Refusal({
     title: "No answer",
     status: 0,
-    detail: "The service does not answer. Check that it is running; this page reconnects automatically.",
+    detail: `The service does not answer. ${advice}`,
     code: "unreachable",
     retryable: true,
   });
@@ -189,7 +189,7 @@ export async function submit(form: FormData, key: string, onSent: (fraction: num
       if (event.lengthComputable) onSent(event.loaded / event.total);
     };
     request.onload = () => resolve();
-    request.onerror = () => reject(unreachable());
+    request.onerror = () => reject(unreachable("Check that it is running, then press Reconstruct again; no job is created twice."));
     request.onabort = () => reject(new DOMException("The upload was stopped.", "AbortError"));
     signal.addEventListener("abort", () => request.abort());
     request.send(form);

@@ -2,7 +2,7 @@
 
 import { type Example, Refusal, exampleFile, getOptions, isAbort, listExamples, newKey, submit } from "./api";
 import { button, h } from "./dom";
-import { OptionsForm, drawn, nameOf } from "./options";
+import { OptionsForm, chosen, drawn, nameOf } from "./options";
 import { refusalBox } from "./refusal";
 import { remember, rememberSame } from "./sent";
 import { PLACES, Slots } from "./slots";
@@ -28,8 +28,8 @@ export class Compose {
   private readonly answer = h("div", { class: "answer", "aria-live": "assertive" });
   private readonly examples = h("p", { class: "examples" });
   private sending: AbortController | null = null;
-  /** The idempotency key, kept while it is unknown whether the service received the job: a retry must not create a second one. */
-  private key: string | null = null;
+  /** A submission and its idempotency key, kept while it is unknown whether the service received it: a retry must not create a second job. */
+  private unsure: { form: FormData; key: string } | null = null;
   private offered: Example[] = [];
   /** The job whose inputs are reused; null: the files in the form. */
   private kept: Job | null = null;
@@ -52,7 +52,6 @@ export class Compose {
       h("div", { class: "send" }, this.answer, h("div", { class: "row" }, this.send, this.stop)),
     );
     const summary = h("summary", {}, h("h2", { id: "compose-title" }, "New reconstruction"));
-    form.addEventListener("change", () => (this.key = null));
     // The browser shows what is wrong with a field only if the field is visible. This event does not bubble.
     const unfold = (event: Event): void => {
       const fold = (event.target as HTMLElement).closest("details");
@@ -66,7 +65,6 @@ export class Compose {
 
   /** The files, or the options for reading them, have changed. */
   private changed(): void {
-    this.key = null;
     const { main } = this.slots;
     if (!this.kept && main !== this.named) {
       this.named = main;
@@ -113,7 +111,7 @@ export class Compose {
   /** Fill the form with the options of a job, to run its inputs again with different ones. */
   again(job: Job): void {
     this.keep(job);
-    this.options.fill(job.options);
+    this.options.fill(chosen(job));
     this.named = job;
     this.label.value = this.filledIn = job.name;
     this.element.open = true;
@@ -123,7 +121,6 @@ export class Compose {
 
   private keep(job: Job | null): void {
     this.kept = job;
-    this.key = null;
     this.inspection.stop();
     this.clear();
     this.keeping.hidden = job === null;
@@ -182,7 +179,13 @@ export class Compose {
 
   private async submit(event: SubmitEvent): Promise<void> {
     event.preventDefault();
+    await this.slots.read; // a file that was just chosen
+    const changed = this.kept ? [] : await this.slots.removeChanged();
     if (this.sending) return;
+    if (changed.length > 0) {
+      this.answer.replaceChildren(h("p", { class: "sentence bad" }, `Not submitted. Changed or deleted since you chose it: ${changed.join(", ")}. Choose it again.`));
+      return;
+    }
     const form = this.kept ? this.keptForm(this.kept) : this.form();
     this.clear();
     if (form === null) {
@@ -206,16 +209,16 @@ export class Compose {
       words.textContent = fraction < 1 ? `Sending, ${percent(fraction)}` : "Sent; the service is reading the files…";
     };
     try {
-      this.key ??= newKey();
-      const job = await submit(form, this.key, onSent, this.sending.signal);
-      this.key = null;
+      if (!this.unsure || !isSame(form, this.unsure.form)) this.unsure = { form, key: newKey() };
+      const job = await submit(form, this.unsure.key, onSent, this.sending.signal);
+      this.unsure = null;
       this.answer.replaceChildren();
       if (this.kept) rememberSame(job.id, this.kept.id);
       else remember(job.id, files);
       this.onJob(job);
     } catch (error) {
       const unknown = isAbort(error) ? sent : error instanceof Refusal && error.problem.retryable;
-      if (!unknown) this.key = null;
+      if (!unknown) this.unsure = null;
       if (isAbort(error)) {
         const words = sent ? "The service already has the files; the job may appear in the list." : "Nothing was submitted.";
         this.answer.replaceChildren(h("p", { class: "muted" }, `Stopped. ${words}`));
@@ -242,7 +245,7 @@ export class Compose {
     const { files, grid } = this.slots.given;
     if (!files.some(([part]) => part === "tracks" || part === "film")) return null;
     if (grid) form.append("mesh", grid);
-    for (const [part, file] of files) form.append(part, file, file.name);
+    for (const [part, file] of files) form.append(part, file);
     return form;
   }
 
@@ -265,6 +268,12 @@ export class Compose {
       this.answer.replaceChildren(shown ? h("p", { class: "sentence bad" }, `Not submitted: see “${placeOf(part, option)}” above.`) : refusalBox(error.problem, choose));
     } else throw error;
   }
+}
+
+/** True if both forms hold the same texts and files. */
+function isSame(one: FormData, other: FormData): boolean {
+  const [entries, others] = [[...one], [...other]];
+  return entries.length === others.length && entries.every(([name, value], index) => name === others[index]?.[0] && value === others[index]?.[1]);
 }
 
 function placeOf(part: string, option: string): string {

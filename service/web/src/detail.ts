@@ -117,6 +117,8 @@ export class Detail {
         this.element.classList.toggle("unknown", refusal !== null && this.job === null);
         if (refusal && this.job === null) say(this.heading, refusal.problem.status === 404 ? "This job does not exist" : "This job cannot be shown");
         this.tell(refusal);
+        // The last estimate of the remaining time may be wrong by now.
+        if (refusal && this.job?.progress) this.countdown.show({ ...this.job, progress: { ...this.job.progress, seconds_left: null } });
       },
     };
     await follow(this.id, follower, this.leaving.signal);

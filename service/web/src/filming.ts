@@ -140,8 +140,13 @@ export class Filming {
     new RegionDialog(given, frames, (done) => this.choose({ ...done, picture: done.picture === this.picture ? null : done.picture })).open();
   }
 
-  private remove(): void {
+  /** Remove the drawn region or the mask picture. */
+  clearRegion(): void {
     this.choose(null);
+  }
+
+  private remove(): void {
+    this.clearRegion();
     this.draw.focus(); // the button, which had the focus, is hidden
   }
 
@@ -161,7 +166,7 @@ export class Filming {
 
   private update(): void {
     const { drawn, mask } = this;
-    if (mask) this.write(`Region: the mask picture ${mask.name}. What is white in it is tracked.`);
+    if (mask) this.write(`Region of the first frame: the mask picture ${mask.name}. What is white in it is tracked.`);
     else if (this.picture) this.write(`${described(drawn?.region ?? null)}${drawn && drawn.frame > 0 ? ` Drawn on frame ${drawn.frame}.` : ""}`);
     else this.write(this.undecoded ? UNDECODED : "Reading the first frame…");
   }

@@ -58,15 +58,11 @@ function named(): string | null {
   return new URLSearchParams(location.hash.slice(1)).get("job") || null;
 }
 
-const GATE = "This service needs a token. Paste the token you were given; this page keeps it until you close the tab.";
-
 /** Show an error that affects the whole page at the top, with a token form if a token is missing. */
 function report(error: unknown): void {
   if (!(error instanceof Refusal)) return reportError(error); // the page keeps refreshing
   const { problem } = error;
-  // The service's message for a missing token is about an HTTP header, which is of no use to a visitor.
-  const words = problem.code === "unauthorized" ? { ...problem, detail: GATE } : problem;
-  fill(said, JSON.stringify(words), () => [refusalBox(words)]);
+  fill(said, JSON.stringify(problem), () => [refusalBox(problem)]);
   if (problem.status === 401 && gate.childElementCount === 0) gate.append(tokenForm());
 }
 

@@ -1,7 +1,7 @@
 // The form for a job's options, built from the service's schema: new options appear automatically.
 
 import { h, uniqueId } from "./dom";
-import type { Options, Schema } from "./types";
+import type { Job, Options, Schema } from "./types";
 
 /** Not in the form: the region is drawn on a frame of the film. */
 const DRAWN = ["region_polygon", "region_frame"];
@@ -146,6 +146,12 @@ export function nameOf(name: string): string {
 /** Return the options of a job that describe its region, which the form does not contain. */
 export function drawn(options: Options): Options {
   return Object.fromEntries(Object.entries(options).filter(([name, value]) => DRAWN.includes(name) && Boolean(value)));
+}
+
+/** Return the options of a job without the frame rate and the picture size that its input states: another input states its own. */
+export function chosen({ options, interpretation }: Job): Options {
+  const stated: Options = { fps: interpretation.fps, image_size: interpretation.image_size };
+  return Object.fromEntries(Object.entries(options).filter(([name, value]) => !(name in stated && value === stated[name])));
 }
 
 interface Field {

@@ -17,6 +17,9 @@ const ON_THE_PAGE: Record<string, string> = {
   duplicate_member: "Save the file again with a unique name for each array.",
 };
 
+/** Instead of the service's message about an HTTP header, which is of no use to a visitor. */
+const GATE = "This service needs a token. Paste the token you were given; this page keeps it until you close the tab.";
+
 /** The hint of the service about an option, and its replacement on the page. */
 const SCHEMA = "Compare with the schema at /v1/options.";
 const FIELD = "Change the value, or clear the field to use the default.";
@@ -25,7 +28,8 @@ const FIELD = "Change the value, or clear the field to use the default.";
  * Return a box that shows a problem. `choose` is called with the interpretation that the user picks if several fit; `inPlace` means
  * that the box is next to the field concerned, so the field is not named again.
  */
-export function refusalBox(problem: Problem, choose?: ((choice: Record<string, unknown>) => void) | null, inPlace = false): HTMLElement {
+export function refusalBox(given: Problem, choose?: ((choice: Record<string, unknown>) => void) | null, inPlace = false): HTMLElement {
+  const problem = given.code === "unauthorized" ? { ...given, detail: GATE, field: null } : given;
   const whole = inPlace ? unnamed(problem) : problem.detail;
   const hintInside = Boolean(problem.hint && whole.endsWith(problem.hint));
   const detail = hintInside ? whole.slice(0, -(problem.hint as string).length).trim() : whole;

@@ -33,6 +33,8 @@ export class Slots {
   readonly element = h("div", { class: "zone" });
   /** True if the service tracks films. */
   hasFilms = false;
+  /** Ends when all given files are read and in their slots. */
+  read: Promise<void> = Promise.resolve();
   private readonly slots = new Map<Part, Slot>();
   private readonly filming = new Filming(() => this.onChange());
   private readonly title = h("p", { class: "zone-title" }, "Drop tracks and a mesh here");
@@ -98,10 +100,25 @@ export class Slots {
     this.slots.get(part)?.input.focus();
   }
 
+  /** Remove the files that were changed or deleted since they were chosen, which a browser cannot send, and return their names. */
+  async removeChanged(): Promise<string[]> {
+    const { files } = this.given;
+    const readable = await Promise.all(files.map(([, file]) => isReadable(file)));
+    const changed = files.filter((_, index) => !readable[index]);
+    for (const [part] of changed) {
+      if (part === "region") this.filming.clearRegion();
+      else await this.show(part, null);
+    }
+    if (changed.length > 0) this.onChange();
+    return changed.map(([, file]) => file.name);
+  }
+
   /** Fill the slots with these files and empty the others. */
-  async fill(files: [Part, File][]): Promise<void> {
-    for (const part of PARTS) await this.show(part, files.find(([of]) => of === part)?.[1] ?? null);
-    this.onChange();
+  fill(files: [Part, File][]): Promise<void> {
+    return this.inTurn(async () => {
+      for (const part of PARTS) await this.show(part, files.find(([of]) => of === part)?.[1] ?? null);
+      this.onChange();
+    });
   }
 
   /** Choose the region to track in the film: corners in film pixels. */
@@ -118,7 +135,7 @@ export class Slots {
   }
 
   /** Assign dropped files to slots by their names and contents. */
-  async take(files: File[]): Promise<void> {
+  private async take(files: File[]): Promise<void> {
     const readable = await Promise.all(files.map(isReadable));
     const contents = files.filter((_, index) => readable[index]);
     const read = await Promise.all(contents.map(async (file): Promise<[File, Entry[]]> => [file, await peek(file)]));
@@ -170,14 +187,17 @@ export class Slots {
       hint: h("span", { class: "hint", id: `${id}-hint` }, hint),
       contents: h("p", { class: "contents hint" }),
       answer: h("div", { class: "slot-answer", "aria-live": "assertive" }),
-      remove: button("×", () => void this.put(part, null).then(() => slot.input.focus()), {
+      remove: button("×", () => void this.inTurn(() => this.put(part, null)).then(() => slot.input.focus()), {
         class: "quiet",
         hidden: true,
         "aria-label": `Remove ${label.toLowerCase()}`,
       }),
       file: null,
     };
-    slot.input.addEventListener("change", () => void this.put(part, slot.input.files?.[0] ?? null));
+    slot.input.addEventListener("change", () => {
+      const file = slot.input.files?.[0] ?? null;
+      void this.inTurn(() => this.put(part, file));
+    });
     this.slots.set(part, slot);
     // The label covers the whole row, to be an easy touch target.
     const choose = h("label", { for: id, class: "choose" }, label);
@@ -191,8 +211,15 @@ export class Slots {
 
   private recording(): HTMLElement | string {
     if (!canRecord()) return "";
-    const film = (recorded: File): void => void this.put("film", recorded);
+    const film = (recorded: File): void => void this.inTurn(() => this.put("film", recorded));
     return h("span", { class: "record" }, button("Record with the camera", () => void new CameraDialog(film).open(), { class: "link" }));
+  }
+
+  /** Do this once all earlier files are in their slots: the last file wins, however long each takes to read. */
+  private inTurn(work: () => Promise<void>): Promise<void> {
+    const done = this.read.then(work);
+    this.read = done.catch(() => undefined); // reported by `done`
+    return done;
   }
 
   private async put(part: Part, file: File | null): Promise<void> {
@@ -253,7 +280,8 @@ export class Slots {
     document.addEventListener("dragleave", over);
     document.addEventListener("drop", (event) => {
       over(event);
-      void this.take([...(event.dataTransfer?.files ?? [])]);
+      const files = [...(event.dataTransfer?.files ?? [])];
+      void this.inTurn(() => this.take(files));
     });
   }
 }

@@ -2,6 +2,7 @@
 
 import { getOptions } from "./api";
 import { button, fill, h } from "./dom";
+import { chosen } from "./options";
 import { sentNames } from "./sent";
 import type { Job, Schema } from "./types";
 
@@ -67,7 +68,7 @@ type Given = [string, unknown][];
 /** The options of a job that differ from the defaults. */
 function given(job: Job, schema: Schema): Given {
   const differs = (name: string, value: unknown): boolean => JSON.stringify(value) !== JSON.stringify(schema.properties?.[name]?.default ?? null);
-  return Object.entries(job.options).filter(([name, value]) => differs(name, value));
+  return Object.entries(chosen(job)).filter(([name, value]) => differs(name, value));
 }
 
 interface FormPart {

@@ -24,7 +24,7 @@ export function openHelp(holder: HTMLElement): void {
   const dialog = h(
     "dialog",
     { class: "help", "aria-labelledby": title },
-    h("h3", { id: title }, "Keys and gestures"),
+    h("h3", { id: title, tabindex: -1, autofocus: true }, "Keys and gestures"), // not the button, which may be below the window
     h("table", {}, h("tbody", {}, ...rows)),
     h("p", { class: "hint" }, "Keys work while the picture has the focus: click it, or press Tab until it is outlined."),
     button("Close", () => dialog.close(), { class: "primary" }),
