@@ -23,6 +23,7 @@ from pliant.client.input_files import (
     region_part,
     tracks_file,
 )
+from pliant.client.result import job_path
 from pliant.schemas.option_faults import option_fault
 from pliant.schemas.options import Options
 from pliant.schemas.problems import ProblemCode
@@ -179,6 +180,7 @@ class Inputs:
         if others:
             raise BadArgument(f"inputs_of: expected no other inputs, got {', '.join(others)} as well.")
         assert self.inputs_of is not None
+        job_path(self.inputs_of)  # refuses what is no id
         return self.inputs_of
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 from pliant.client.errors import BadArgument, JobCancelled, JobFailed, NotAllowedNow, NotFound, NotLoaded
+from pliant.client.input_files import expanded
 from pliant.schemas.job import Job, Problem, Status
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ class Reconstruction:
             self.folder = Path(tempfile.mkdtemp(prefix="pliant-result-"))
             weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
         else:
-            self.folder = Path(folder)
+            self.folder = expanded(folder, "folder")
 
     def __repr__(self) -> str:
         size = f"{self.job.interpretation.num_frames} frames × {self.job.interpretation.num_points} points"
@@ -149,7 +150,7 @@ class Reconstruction:
 
 def copied(source: Path, path: Path | str) -> Path:
     """Copy a downloaded file to `path`, creating folders as needed; it may be there already."""
-    target = Path(path)
+    target = expanded(path, "path")
     target.parent.mkdir(parents=True, exist_ok=True)
     if not target.exists() or not target.samefile(source):
         shutil.copyfile(source, target)
@@ -169,7 +170,7 @@ def job_path(job: str) -> str:
     BadArgument
         The id is malformed.
     """
-    if re.fullmatch(r"[A-Za-z0-9_-]{1,128}", job) is None:
+    if not isinstance(job, str) or re.fullmatch(r"[A-Za-z0-9_-]{1,128}", job) is None:
         raise BadArgument(f"Expected the id of a job (letters, digits, - and _), got {job!r}.")
     return f"/v1/jobs/{job}"
 

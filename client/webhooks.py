@@ -19,6 +19,8 @@ from pliant.schemas.job import Job
 from pydantic import ValidationError
 
 PREFIX = "whsec_"
+SHORTEST_KEY = 24
+"""Minimum length of a secret, random bytes, as the service requires it."""
 
 
 def new_secret() -> str:
@@ -56,14 +58,17 @@ def verified(
     InvalidSignature
         The message is forged, altered or too old.
     BadArgument
-        The secret is malformed.
+        The secret is malformed or empty.
     """
     try:
         key = base64.b64decode(secret.removeprefix(PREFIX), validate=True)
     except (binascii.Error, ValueError):
+        key = b""
+    if len(key) < SHORTEST_KEY:  # anybody could sign with an empty one
         raise BadArgument(
-            f"secret: expected {PREFIX} followed by base64, got something else. Use the value passed as webhook_secret."
-        ) from None
+            f"secret: expected {PREFIX} followed by {SHORTEST_KEY} bytes or more in base64, got something else. "
+            "Use the value passed as webhook_secret."
+        )
     given = {name.lower(): value for name, value in headers.items()}
     try:
         name, moment, signatures = given["webhook-id"], given["webhook-timestamp"], given["webhook-signature"]

@@ -11,6 +11,9 @@ from pliant.schemas.options import Options
 from pliant.schemas.problems import RETRYABLE_STATUSES, find_code, type_of
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+HEARTBEAT_SECONDS = 15.0
+"""Seconds between two comments of an event stream in which nothing happens, unless the operator sets another period."""
+
 
 class Status(StrEnum):
     """Status of a job. The last three are final and never change."""

@@ -10,7 +10,16 @@ from functools import partial
 from numbers import Real
 from typing import Annotated, Literal, get_args
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidatorFunctionWrapHandler,
+    WithJsonSchema,
+    field_validator,
+)
 
 SOLVER_FIELDS = (
     "method", "camera", "surface", "order", "basis_size", "refine_rotations", "preset", "temporal_weight", "spatial_weight", "robust_scale",
@@ -76,10 +85,22 @@ Pixel = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Outputs = Annotated[tuple[Output, ...], Field(max_length=64), BeforeValidator(_listed), AfterValidator(_in_order)]
 
 
-class Options(BaseModel):
-    """Options of a reconstruction. Every option has a default; unknown names are rejected."""
+class Chosen(BaseModel):
+    """Base of the options that a request sets: unknown names are rejected, and so are `true` and `false` for numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @field_validator("*", mode="wrap")
+    @classmethod
+    def _refuse_booleans_for_numbers(cls, given: object, read: ValidatorFunctionWrapHandler) -> object:
+        value = read(given)
+        if isinstance(given, bool) and not isinstance(value, bool):
+            raise ValueError("a number")
+        return value
+
+
+class Options(Chosen):
+    """Options of a reconstruction. Every option has a default; unknown names are rejected."""
 
     method: Literal["pseudo_inverse", "temporal", "spatio_temporal", "robust"] = Field(
         "robust",

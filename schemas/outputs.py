@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pliant.schemas.options import Options, Outputs
-from pydantic import BaseModel, ConfigDict, Field
+from pliant.schemas.options import Chosen, Options, Outputs
+from pydantic import Field
 
 RESTATED = ("fps", "normals", "colours", "axes", "glb_quantized", "glb_motion")
 """Options of a job that a request for further files may override."""
 
 
-class OutputRequest(BaseModel):
+class OutputRequest(Chosen):
     """Files to write from a stored result. Options that are null keep the job's values."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     outputs: Annotated[Outputs, Field(min_length=1)] = Field(
         description="Files to write: glb, ply, obj, usd, abc, mdd, mat, csv; see the option `outputs` of a job."

@@ -13,6 +13,9 @@ _LENGTHS = {
 }
 """Types of errors about a length: the words before the limit, its key in the error's context, and its unit."""
 
+_EXPLAINED = ("int_parsing", "int_from_float", "float_parsing", "bool_parsing")
+"""Types of errors whose message continues, after a comma, with what was wrong."""
+
 
 def expectation(error: Mapping[str, Any]) -> str:
     """Describe what one of `ValidationError.errors()` expected, such as ``'l1', 'l2' or 'huber'`` or ``greater than 0``."""
@@ -24,7 +27,13 @@ def expectation(error: Mapping[str, Any]) -> str:
         words, limit, unit = _LENGTHS[error["type"]]
         count = int(error["ctx"][limit])
         return f"{words} {count:,} {unit}{'' if count == 1 else 's'}"
+    if error["type"] == "extra_forbidden":
+        return "no value, because the name is unknown"
+    if error["type"] == "string_pattern_mismatch":
+        return f"text that matches {error['ctx']['pattern']}"
     message = str(error["msg"])
+    if error["type"] in _EXPLAINED:
+        message = message.partition(",")[0]
     for introduction in ("Input should be ", "Value error, "):
         message = message.removeprefix(introduction)
     return message[:1].lower() + message[1:]

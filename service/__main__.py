@@ -16,7 +16,7 @@ from pliant.service.app import create_app
 from pliant.service.settings import ServiceSettings
 from pliant.worker import tracing
 from pliant.worker.environment import variable_of
-from pliant.worker.errors import InvalidSetting, NewerData, StoreUnavailable
+from pliant.worker.errors import InvalidSetting, StoreUnavailable, WorkerError
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.logs import configure_logging
 from pliant.worker.settings import Settings
@@ -107,10 +107,10 @@ def main(arguments: Sequence[str] = ()) -> int:
         tracing.configure(of_worker.tracing, service="pliant-api")
         with suppress(StoreUnavailable):  # requests are answered 503 until the store is back
             prepare(of_worker)
-    except (InvalidSetting, NewerData) as error:
+        app = create_app(Jobs.open(of_worker), settings, tokens=tokens)
+    except WorkerError as error:
         sys.stderr.write(f"{error}\n")
         return 2
-    app = create_app(Jobs.open(of_worker), settings, tokens=tokens)
     config = uvicorn.Config(
         app,
         host=settings.host,

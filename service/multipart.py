@@ -306,5 +306,5 @@ def _too_large(limit: int, got: str, *, what: str = "body") -> Refusal:
         field=what,
         expected=f"at most {limit} bytes",
         got=got,
-        hint="Send fewer frames or points, or store float32; see /v1/limits.",
+        hint="Send fewer frames or points, or store float32; see /v1/limits." if what == "body" else "Shorten it.",
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 from typing import Annotated, Literal
 
+from pliant.schemas.job import HEARTBEAT_SECONDS
 from pliant.worker.environment import read
 from pliant.worker.logs import LogFormat, LogLevel
 from pydantic import BeforeValidator, Field
@@ -50,7 +51,7 @@ class ServiceSettings:
     """Seconds without a byte of an unfinished body after which the request is refused."""
     max_wait_seconds: int = Field(default=60, ge=0)
     """Longest wait that `Prefer: wait=n` can request, in seconds."""
-    heartbeat_seconds: float = Field(default=15.0, gt=0)
+    heartbeat_seconds: float = Field(default=HEARTBEAT_SECONDS, gt=0)
     """Seconds without an event after which an event stream sends a comment line."""
     allowed_hosts: Listed = ()
     """Accepted values of the Host header, separated by commas. Empty: the names of the loopback address if the service is

@@ -111,14 +111,13 @@ def accept(
         form, options, submission = kept.form, kept.options, replace(submission, name=name or kept.job.name)
     if kept is not None and kept.canonical is not None:
         read = _read_again(kept.job.interpretation, options)
-        return jobs.submit(
+        return jobs.submit_once(
             kept.canonical, replace(submission, options=read.options), interpretation=read.interpretation
-        ), True
+        )
     canonical = folder / "canonical.npz"
     films = FilmBounds.of(jobs.settings, max_bytes=limits.max_bytes)
     read = read_form(form, options, limits, films=films, target=canonical)
-    job = jobs.submit(canonical, replace(submission, options=read.options), interpretation=read.interpretation)
-    return job, True
+    return jobs.submit_once(canonical, replace(submission, options=read.options), interpretation=read.interpretation)
 
 
 @dataclass(frozen=True)
@@ -321,7 +320,7 @@ def parse_options(text: str) -> Options:
     try:
         given: Any = json.loads(text)
     except (ValueError, RecursionError):
-        raise _not_an_object("something else") from None
+        raise _not_an_object("text that is not JSON") from None
     if not isinstance(given, dict):
         raise _not_an_object(f"a JSON {type(given).__name__}")
     try:

@@ -20,7 +20,7 @@ from pliant.worker.maintenance.fsck import findings
 from pliant.worker.maintenance.reconciler import Reconciler
 from pliant.worker.paths import make_data_directory
 from pliant.worker.settings import NUMERICAL_THREADS, Settings
-from pliant.worker.store.connection import BLOCK_WITHIN, connect
+from pliant.worker.store.connection import BLOCK_WITHIN, connect, reachable
 from pliant.worker.store.queue import RedisQueue
 from pliant.worker.store.redis import RedisRecords
 from pliant.worker.store.schema import prepare
@@ -52,14 +52,16 @@ def work(settings: Settings) -> int:
         for decode in (False, True)
     )
     connection = connect(settings.redis, decode=False, answer_within=BLOCK_WITHIN)
-    PliantWorker(
-        settings=settings,
-        connection=connection,
-        quick=quick,
-        records=RedisRecords(text, prefix=settings.queue),
-        queue=RedisQueue(connection, name=settings.queue),
-        name=secrets.token_hex(6),
-    ).work(logging_level=None)
+    with reachable():  # RQ connects at once; the supervisor repeats a start without a store
+        worker = PliantWorker(
+            settings=settings,
+            connection=connection,
+            quick=quick,
+            records=RedisRecords(text, prefix=settings.queue),
+            queue=RedisQueue(connection, name=settings.queue),
+            name=secrets.token_hex(6),
+        )
+    worker.work(logging_level=None)
     return 0
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pliant.client._async.job import AsyncRemoteJob, AsyncResult
-from pliant.client.errors import PliantError
+from pliant.client.errors import BadArgument, PliantError
 from pliant.client.input_files import Source, job_name
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ async def mapped(
     submission: Mapping[str, Any],
 ) -> AsyncGenerator[AsyncResult, None]:
     """Submit inputs and yield their results: see `AsyncClient.map`."""
+    if at_once < 1:
+        raise BadArgument(f"at_once: expected at least 1 job, got {at_once}.")
     ahead: deque[tuple[int, AsyncRemoteJob]] = deque()
 
     async def finished() -> AsyncResult | None:

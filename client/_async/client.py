@@ -22,10 +22,10 @@ from pliant.client._async.job import AsyncRemoteJob, AsyncResult
 from pliant.client._async.operations import OnJob
 from pliant.client.call import Call
 from pliant.client.errors import NotFound
-from pliant.client.input_files import Region, Source
+from pliant.client.input_files import Region, Source, expanded
 from pliant.client.multipart import Inputs, OnBytes, option_fields
 from pliant.client.pauses import in_thread
-from pliant.client.requests import further, sharing
+from pliant.client.requests import further, key_header, sharing, status_names
 from pliant.client.result import finished, job_path, loaded, succeeded
 from pliant.client.retry import SUBMISSION
 from pliant.schemas.job import Interpretation, Job, JobPage, Priority, ServiceLimits, Status
@@ -263,7 +263,7 @@ class AsyncClient(AsyncConnection):
 
         Parameters
         ----------
-        statuses : iterable of Status or str
+        statuses : iterable of Status or str, or one of them
             Only jobs with one of these; by default all.
         limit : int, optional
             At most this many jobs; by default all.
@@ -271,8 +271,13 @@ class AsyncClient(AsyncConnection):
             Jobs per request, at most 200.
         timeout : float, optional
             Seconds for all requests together.
+
+        Raises
+        ------
+        BadArgument
+            There is no such status.
         """
-        exchange, wanted = self._exchange(timeout), [Status(status).value for status in statuses]
+        exchange, wanted = self._exchange(timeout), status_names(statuses)
         left = math.inf if limit is None else limit
         cursor: str | None = ""
         while cursor is not None and left > 0:
@@ -355,7 +360,7 @@ class AsyncClient(AsyncConnection):
         self, job: str, *, idempotency_key: str | None = None, timeout: float | None = None
     ) -> AsyncRemoteJob:
         """Queue and return a new job with the inputs and options of a failed or cancelled one; `idempotency_key` as in `submit`."""
-        headers = {"Idempotency-Key": idempotency_key or secrets.token_urlsafe(16)}
+        headers = key_header(secrets.token_urlsafe(16) if idempotency_key is None else idempotency_key)
         call = Call(method="POST", path=f"{job_path(job)}/retry", headers=headers)
         return AsyncRemoteJob(self, await self._exchange(timeout, SUBMISSION).record(call, Job))
 
@@ -394,7 +399,7 @@ class AsyncClient(AsyncConnection):
             The service refuses the request; see `pliant.client.errors`.
         """
         request = further(outputs, {**options, **({} if fps is None else {"fps": fps})})
-        headers = JSON_BODY | ({} if idempotency_key is None else {"Idempotency-Key": idempotency_key})
+        headers = JSON_BODY | ({} if idempotency_key is None else key_header(idempotency_key))
         body = request.model_dump_json(exclude_unset=True).encode()
         call = Call(method="POST", path=f"{job_path(job)}/outputs", headers=headers, content=body, changes_nothing=True)
         return AsyncRemoteJob(self, await self._exchange(timeout, "the request for further files").record(call, Job))
@@ -447,8 +452,8 @@ class AsyncClient(AsyncConnection):
             The id of a job that has succeeded.
         folder : path
             Where the files are written; it is created if it does not exist.
-        names : iterable of str, optional
-            Names of the files; by default all.
+        names : iterable of str, or str, optional
+            Names of the files, or of one file; by default all.
         on_download : callable, optional
             Called with (bytes of this file so far, total bytes of this file).
         timeout : float, optional
@@ -461,7 +466,9 @@ class AsyncClient(AsyncConnection):
         """
         exchange = self._exchange(timeout, f"the download of job {job}")
         record = await exchange.record(Call(method="GET", path=job_path(job)), Job)
-        return await operations.fetch(exchange, record, Path(folder), names=names, on_download=on_download)
+        return await operations.fetch(
+            exchange, record, expanded(folder, "folder"), names=names, on_download=on_download
+        )
 
     async def options(self, *, timeout: float | None = None) -> dict[str, Any]:
         """Return the JSON Schema of the options: names, meanings, bounds, defaults."""

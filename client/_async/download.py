@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from functools import partial
 from pathlib import Path
@@ -10,8 +11,9 @@ import httpx
 from pliant.client._async.transport import Exchange
 from pliant.client.call import Call
 from pliant.client.errors import CorruptDownload
+from pliant.client.locks import lock
 from pliant.client.multipart import OnBytes, sha256
-from pliant.client.pauses import in_thread
+from pliant.client.pauses import async_sleep, in_thread
 from pliant.schemas.job import Artifact
 
 
@@ -21,7 +23,8 @@ async def download(
     """Download an artifact into a folder, under its own name.
 
     The bytes go to a partial file in the same folder, whose name contains the SHA-256. It is renamed once it is complete and
-    correct, so a file with the artifact's name is always complete. A partial file of an earlier call is continued.
+    correct, so a file with the artifact's name is always complete. A partial file of an earlier call is continued, and that of a
+    call under way is waited for.
 
     Raises
     ------
@@ -30,20 +33,38 @@ async def download(
     """
     folder.mkdir(parents=True, exist_ok=True)
     whole = folder / Path(artifact.name).name
-    if (
+    part = folder / f".{whole.name}.{artifact.sha256[:16]}.part"
+    while not await _complete(whole, artifact):
+        held = lock(part)
+        if held is None:  # another call downloads this file into this folder: wait for it
+            exchange.attempts.remaining()
+            await async_sleep(exchange.attempts.retries.poll_interval)
+            continue
+        with held:
+            await _fetch(exchange, path, artifact, part, on_download=on_download)
+            part.replace(whole)
+        break
+    return whole
+
+
+async def _complete(whole: Path, artifact: Artifact) -> bool:
+    """Return True if the file is there and correct."""
+    return (
         whole.is_file()
         and whole.stat().st_size == artifact.bytes
         and await in_thread(partial(sha256, whole)) == artifact.sha256
-    ):
-        return whole
-    part = folder / f".{whole.name}.{artifact.sha256[:16]}.part"
+    )
+
+
+async def _fetch(exchange: Exchange, path: str, artifact: Artifact, part: Path, *, on_download: OnBytes | None) -> None:
+    """Complete the partial file; download it once more if its SHA-256 is wrong. Raises as `download`."""
     for _ in range(2):
-        if not part.is_file() or part.stat().st_size < artifact.bytes or artifact.bytes == 0:
+        if part.stat().st_size < artifact.bytes or artifact.bytes == 0:
             await _fill(exchange, path, artifact, part, on_download=on_download)
         if await in_thread(partial(sha256, part)) == artifact.sha256:
-            part.replace(whole)
-            return whole
-        part.unlink()
+            return
+        os.truncate(part, 0)
+    part.unlink()
     raise CorruptDownload(
         f"{artifact.name} was downloaded twice and does not have the SHA-256 {artifact.sha256} of the job's record. "
         "Something between this machine and the service changes the bytes; try another connection."

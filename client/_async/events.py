@@ -11,10 +11,7 @@ from pliant.client.call import Call
 from pliant.client.errors import UnexpectedAnswer
 from pliant.client.events import MEDIA_TYPE, Parser, Position, merged
 from pliant.client.pauses import async_sleep
-from pliant.schemas.job import Job
-
-HEARTBEAT = 15.0
-"""Seconds between two comments of an event stream in which nothing happens."""
+from pliant.schemas.job import HEARTBEAT_SECONDS, Job
 
 
 async def follow(exchange: Exchange, path: str) -> AsyncGenerator[Job, None]:
@@ -61,7 +58,7 @@ async def _stream(exchange: Exchange, path: str, seen: Position) -> AsyncGenerat
                         yield job
                     if seen.final:
                         return
-                if exchange.attempts.remaining() < HEARTBEAT:
+                if exchange.attempts.remaining() < HEARTBEAT_SECONDS:
                     return  # a read may take as long as was left when the stream was opened
     except httpx.TransportError as lost:
         await exchange.pause_or_raise(call, lost)

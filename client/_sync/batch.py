@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pliant.client._sync.job import RemoteJob, Result
-from pliant.client.errors import PliantError
+from pliant.client.errors import BadArgument, PliantError
 from pliant.client.input_files import Source, job_name
 
 if TYPE_CHECKING:
@@ -31,6 +31,8 @@ def mapped(
     submission: Mapping[str, Any],
 ) -> Generator[Result, None, None]:
     """Submit inputs and yield their results: see `Client.map`."""
+    if at_once < 1:
+        raise BadArgument(f"at_once: expected at least 1 job, got {at_once}.")
     ahead: deque[tuple[int, RemoteJob]] = deque()
 
     def finished() -> Result | None:

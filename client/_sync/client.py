@@ -23,10 +23,10 @@ from pliant.client._sync.job import RemoteJob, Result
 from pliant.client._sync.operations import OnJob
 from pliant.client.call import Call
 from pliant.client.errors import NotFound
-from pliant.client.input_files import Region, Source
+from pliant.client.input_files import Region, Source, expanded
 from pliant.client.multipart import Inputs, OnBytes, option_fields
 from pliant.client.pauses import in_place
-from pliant.client.requests import further, sharing
+from pliant.client.requests import further, key_header, sharing, status_names
 from pliant.client.result import finished, job_path, loaded, succeeded
 from pliant.client.retry import SUBMISSION
 from pliant.schemas.job import Interpretation, Job, JobPage, Priority, ServiceLimits, Status
@@ -264,7 +264,7 @@ class Client(Connection):
 
         Parameters
         ----------
-        statuses : iterable of Status or str
+        statuses : iterable of Status or str, or one of them
             Only jobs with one of these; by default all.
         limit : int, optional
             At most this many jobs; by default all.
@@ -272,8 +272,13 @@ class Client(Connection):
             Jobs per request, at most 200.
         timeout : float, optional
             Seconds for all requests together.
+
+        Raises
+        ------
+        BadArgument
+            There is no such status.
         """
-        exchange, wanted = self._exchange(timeout), [Status(status).value for status in statuses]
+        exchange, wanted = self._exchange(timeout), status_names(statuses)
         left = math.inf if limit is None else limit
         cursor: str | None = ""
         while cursor is not None and left > 0:
@@ -354,7 +359,7 @@ class Client(Connection):
 
     def retry(self, job: str, *, idempotency_key: str | None = None, timeout: float | None = None) -> RemoteJob:
         """Queue and return a new job with the inputs and options of a failed or cancelled one; `idempotency_key` as in `submit`."""
-        headers = {"Idempotency-Key": idempotency_key or secrets.token_urlsafe(16)}
+        headers = key_header(secrets.token_urlsafe(16) if idempotency_key is None else idempotency_key)
         call = Call(method="POST", path=f"{job_path(job)}/retry", headers=headers)
         return RemoteJob(self, self._exchange(timeout, SUBMISSION).record(call, Job))
 
@@ -393,7 +398,7 @@ class Client(Connection):
             The service refuses the request; see `pliant.client.errors`.
         """
         request = further(outputs, {**options, **({} if fps is None else {"fps": fps})})
-        headers = JSON_BODY | ({} if idempotency_key is None else {"Idempotency-Key": idempotency_key})
+        headers = JSON_BODY | ({} if idempotency_key is None else key_header(idempotency_key))
         body = request.model_dump_json(exclude_unset=True).encode()
         call = Call(method="POST", path=f"{job_path(job)}/outputs", headers=headers, content=body, changes_nothing=True)
         return RemoteJob(self, self._exchange(timeout, "the request for further files").record(call, Job))
@@ -446,8 +451,8 @@ class Client(Connection):
             The id of a job that has succeeded.
         folder : path
             Where the files are written; it is created if it does not exist.
-        names : iterable of str, optional
-            Names of the files; by default all.
+        names : iterable of str, or str, optional
+            Names of the files, or of one file; by default all.
         on_download : callable, optional
             Called with (bytes of this file so far, total bytes of this file).
         timeout : float, optional
@@ -460,7 +465,7 @@ class Client(Connection):
         """
         exchange = self._exchange(timeout, f"the download of job {job}")
         record = exchange.record(Call(method="GET", path=job_path(job)), Job)
-        return operations.fetch(exchange, record, Path(folder), names=names, on_download=on_download)
+        return operations.fetch(exchange, record, expanded(folder, "folder"), names=names, on_download=on_download)
 
     def options(self, *, timeout: float | None = None) -> dict[str, Any]:
         """Return the JSON Schema of the options: names, meanings, bounds, defaults."""

@@ -12,10 +12,7 @@ from pliant.client.call import Call
 from pliant.client.errors import UnexpectedAnswer
 from pliant.client.events import MEDIA_TYPE, Parser, Position, merged
 from pliant.client.pauses import sleep
-from pliant.schemas.job import Job
-
-HEARTBEAT = 15.0
-"""Seconds between two comments of an event stream in which nothing happens."""
+from pliant.schemas.job import HEARTBEAT_SECONDS, Job
 
 
 def follow(exchange: Exchange, path: str) -> Generator[Job, None, None]:
@@ -62,7 +59,7 @@ def _stream(exchange: Exchange, path: str, seen: Position) -> Generator[Job, Non
                         yield job
                     if seen.final:
                         return
-                if exchange.attempts.remaining() < HEARTBEAT:
+                if exchange.attempts.remaining() < HEARTBEAT_SECONDS:
                     return  # a read may take as long as was left when the stream was opened
     except httpx.TransportError as lost:
         exchange.pause_or_raise(call, lost)

@@ -20,6 +20,7 @@ from pliant.client.call import Call
 from pliant.client.errors import InvalidRequest
 from pliant.client.multipart import Inputs, OnBytes, option_fields
 from pliant.client.pauses import in_place, sleep
+from pliant.client.requests import key_header
 from pliant.client.result import job_path, unknown_file
 from pliant.schemas.job import Job
 from pliant.schemas.options import Options
@@ -47,18 +48,19 @@ def submit(
 ) -> Job:
     """Submit inputs and return the new job. Temporary files are written to `folder`, which the caller removes."""
     texts = {
-        "name": name, "webhook": webhook or "", "webhook_secret": webhook_secret or "",
+        "name": name.encode("utf-8", "replace").decode(), "webhook": webhook or "", "webhook_secret": webhook_secret or "",
         "priority": "" if priority == "normal" else priority,  # omitted for services without priorities
     }  # fmt: skip
     fields = option_fields(options) | {key: text for key, text in texts.items() if text != ""}
     whole = in_place(partial(inputs.form, folder, fields, exchange.attempts.bounding(on_upload)))
     key = idempotency_key if idempotency_key is not None else secrets.token_urlsafe(16)
+    headers = key_header(key) if job_id is None else {}
     for attempt in (1, 2, 3):
         form = upload_large(exchange, whole, key if job_id is None else f"id:{job_id}")
         call = Call(
             method="POST" if job_id is None else "PUT",
             path="/v1/jobs" if job_id is None else job_path(job_id),
-            headers={"Idempotency-Key": key} if job_id is None else {},
+            headers=headers,
             form=form,
         )
         try:
@@ -112,7 +114,7 @@ def fetch(
     """
     held = {artifact.name: artifact for artifact in job.artifacts}
     paths = {}
-    for name in held if names is None else names:
+    for name in held if names is None else [names] if isinstance(names, str) else names:
         if name not in held:
             raise unknown_file(job, name)
         url = f"{job_path(job.id)}/artifacts/{quote(name)}"

@@ -28,7 +28,7 @@ class OriginCheck:
     def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
         self._app = app
         self._hosts = frozenset(map(_without_port, settings.allowed_hosts)) or (
-            _LOOPBACK_HOSTS if settings.loopback else frozenset()
+            _LOOPBACK_HOSTS | {settings.host.lower()} if settings.loopback else frozenset()
         )
         self._origins = frozenset(settings.cors_origins)
 

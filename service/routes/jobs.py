@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from typing import Annotated
 
 from anyio import to_thread
@@ -17,26 +18,31 @@ from pliant.service.submission import accept, form_rules
 from pliant.worker.errors import StoreUnavailable, UnknownJob
 from pliant.worker.jobs.retry import retry as run_again
 from pliant.worker.jobs.service import Jobs
-from pliant.worker.jobs.validation import LARGEST_PAGE
+from pliant.worker.jobs.validation import LARGEST_PAGE, LONGEST_KEY, check_key
+from pydantic import WithJsonSchema
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
 Id = Annotated[str, Path(description="The job's id.", examples=["4f0c6b1d2a9e8c7b5d3f"])]
 _KeyHeader = Annotated[
-    str | None,
+    Annotated[str, WithJsonSchema({"type": "string", "maxLength": LONGEST_KEY})] | None,
     Header(
         alias="Idempotency-Key",
-        max_length=255,
         description="Any text of your own, e.g. a UUID. The same key with the same content returns the first job.",
     ),
 ]
 
 
 def idempotency_key(request: Request, key: _KeyHeader = None) -> str | None:
-    """Return the `Idempotency-Key`; several are refused, because each could stand for another job."""
+    """Return the `Idempotency-Key`, as UTF-8 if it is; several are refused, because each could stand for another job."""
     if len(request.headers.getlist("idempotency-key")) > 1:
         detail = "The header Idempotency-Key was sent more than once. Send one key."
         raise Refusal(ProblemCode.CONFLICTING_HEADERS, detail=detail, field="Idempotency-Key")
+    if key is None:
+        return None
+    with suppress(UnicodeDecodeError):
+        key = key.encode("latin-1").decode()  # ASGI decodes headers as Latin-1
+    check_key(key)
     return key
 
 

@@ -30,7 +30,7 @@ async def read_json(request: Request, model: type[Model]) -> Model:
     limits = {"max_bytes": settings.max_text_bytes, "stall_seconds": settings.stall_seconds}
     body = b"".join([piece async for piece in batches(request, **limits)])  # type: ignore[arg-type]
     try:
-        return model.model_validate_json(body or b"{}")
+        return model.model_validate_json(body.decode("utf-8", "replace") or "{}")
     except ValidationError as error:
         raise from_validation(error.errors()) from None
 

@@ -205,6 +205,9 @@ def test_jobs_are_listed_newest_first_over_pages_and_by_status(client: Client) -
             client.cancel(id)
     assert ids[0] in [job.id for job in client.list(statuses=["succeeded"])]
     assert all(job.status is Status.SUCCEEDED for job in client.list(statuses=[Status.SUCCEEDED]))
+    assert [job.id for job in client.list(statuses="succeeded")] == [
+        job.id for job in client.list(statuses=["succeeded"])
+    ]
 
 
 def test_a_finished_job_can_be_deleted_but_not_cancelled(client: Client) -> None:
@@ -229,6 +232,7 @@ def test_an_unknown_job_and_an_unknown_file_are_not_found(client: Client, tmp_pa
     result = client.submit(moving_points(), options=FAST).wait(timeout=60)
     with pytest.raises(NotFound, match=r"nonsense\.obj.*shapes\.npz"):
         result.download(tmp_path, names=["nonsense.obj"])
+    assert result.download(tmp_path, names="report.json") == {"report.json": tmp_path / "report.json"}
 
 
 def test_the_service_describes_its_options_and_limits(client: Client) -> None:

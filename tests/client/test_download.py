@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
-from pliant.client import Client, CorruptDownload, Retry, Unreachable
+from pliant.client import AsyncClient, Client, CorruptDownload, Retry, Unreachable, WaitTimeout
+from pliant.client.locks import lock
 from pliant.service.testing import InMemoryService
 
 QUICK = Retry(shortest_pause=0.001, longest_pause=0.001, poll_interval=0.01, patience=0.2)
@@ -127,6 +130,46 @@ def test_corrupt_partial_downloads_are_replaced(tmp_path: Path) -> None:
         client.download(job, tmp_path, names=["shapes.npz"])
         assert (tmp_path / "shapes.npz").read_bytes() == data
         (tmp_path / "shapes.npz").unlink()
+
+
+def test_simultaneous_downloads_into_one_folder_wait_for_each_other(tmp_path: Path) -> None:
+    async def run() -> list[dict[str, Path]]:
+        async with AsyncClient("http://pliant.test", transport=InMemoryService(), retries=QUICK) as client:
+            job = await client.submit(POINTS)
+            await job.wait(load=False, timeout=30)
+            return await asyncio.gather(*[client.download(job.id, tmp_path) for _ in range(4)])
+
+    first, *others = asyncio.run(run())
+    assert others == [first] * 3
+    assert {path.name for path in tmp_path.iterdir()} == set(first)
+
+
+def test_a_partial_file_that_another_process_writes_is_left_alone(tmp_path: Path) -> None:
+    client, job, data = finished_job(Tearing(10**9))
+    name = f".shapes.npz.{hashlib.sha256(data).hexdigest()[:16]}.part"
+    held = lock(tmp_path / name)
+    assert held is not None
+    with held:
+        with pytest.raises(WaitTimeout):
+            client.download(job, tmp_path, names="shapes.npz", timeout=0.5)
+        assert (tmp_path / name).stat().st_size == 0
+        (tmp_path / name).rename(tmp_path / "shapes.npz")  # as the other one does at its end
+        another = lock(tmp_path / name)
+        assert another is not None
+        with another:
+            assert lock(tmp_path / name) is None
+    client.download(job, tmp_path, names="shapes.npz", timeout=30)
+    assert (tmp_path / "shapes.npz").read_bytes() == data
+
+
+def test_folders_and_files_can_be_in_the_home_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    with Client("http://pliant.test", transport=InMemoryService(), retries=QUICK) as client:
+        result = client.submit(POINTS).wait(folder="~/first", timeout=30)
+        result.download("~/second", names="report.json")
+        result.save_glb("~/third.glb")
+    found = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*")}
+    assert {"first/shapes.npz", "second/report.json", "third.glb"} <= found
 
 
 def test_the_animation_can_be_saved_where_it_was_downloaded(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pliant.client import AsyncClient, Client, InvalidRequest, PliantError
+from pliant.client import AsyncClient, BadArgument, Client, InvalidRequest, PliantError
 from pliant.client.input_files import LONGEST_NAME
 from pliant.service.testing import InMemoryService
 
@@ -48,6 +48,11 @@ def test_a_rejected_input_ends_the_map_or_is_reported() -> None:
     assert len(done) == 2
     assert [number for number, _ in failed] == [1]
     assert isinstance(failed[0][1], InvalidRequest)
+
+
+def test_at_least_one_job_is_submitted_ahead() -> None:
+    with Client("http://pliant.test") as client, pytest.raises(BadArgument, match="at_once: expected at least 1 job"):
+        list(client.map(inputs(1), at_once=0))
 
 
 def test_the_same_key_returns_the_existing_jobs() -> None:

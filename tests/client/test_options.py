@@ -7,8 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 from pliant.schemas.options import SOLVER_FIELDS, Options
+from pliant.schemas.outputs import OutputRequest
 from pliant.schemas.suggestions import closest
 from pliant.solver import Settings
+from pydantic import ValidationError
 
 
 def test_options_mirror_the_solver_settings_and_their_defaults() -> None:
@@ -56,6 +58,15 @@ def test_an_unknown_name_suggests_the_option_that_was_meant(given: str, meant: s
 def test_another_word_for_a_name_is_known_where_the_name_is() -> None:
     assert closest("mask", ["mesh", "region"]) == "region"
     assert closest("mask", ["task", "mesh"]) == "task"
+
+
+@pytest.mark.parametrize("given", [{"fps": True}, {"seed": False}, {"temporal_order": True}, {"min_seen": True}])
+def test_a_boolean_is_no_number(given: dict[str, bool]) -> None:
+    with pytest.raises(ValidationError, match="a number"):
+        Options.model_validate(given)
+    assert Options.model_validate({"refine_rotations": False}).refine_rotations is False
+    with pytest.raises(ValidationError, match="a number"):
+        OutputRequest.model_validate({"outputs": ["glb"], "fps": True})
 
 
 def test_an_unknown_output_is_rejected_with_the_known_names() -> None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import pytest
 from pliant.schemas.options import Options
+from pliant.schemas.outputs import OutputRequest
 from pliant.schemas.validation import expectation
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 
 class Named(BaseModel):
-    name: str
+    name: Annotated[str, Field(pattern="^[a-z]$")]
 
 
 @pytest.mark.parametrize(
@@ -17,8 +20,12 @@ class Named(BaseModel):
     [
         (Options, {"loss": "l3"}, "'l1', 'l2' or 'huber'"),
         (Options, {"fps": 0}, "greater than 0"),
-        (Options, {"seed": "x"}, "a valid integer, unable to parse string as an integer"),
+        (Options, {"seed": "x"}, "a valid integer"),
+        (Options, {"seed": 1.5}, "a valid integer"),
+        (Options, {"refine_rotations": "maybe"}, "a valid boolean"),
+        (OutputRequest, {"outputs": ["glb"], "normal": "none"}, "no value, because the name is unknown"),
         (Named, {}, "a value"),
+        (Named, {"name": "B"}, "text that matches ^[a-z]$"),
     ],
 )
 def test_pydantic_errors_become_expectations(model: type[BaseModel], given: dict[str, object], words: str) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import hashlib
+import hmac
 from datetime import UTC, datetime
 
 import numpy as np
@@ -79,8 +81,17 @@ def test_a_signed_message_without_a_job_is_an_error(body: bytes) -> None:
 def test_secrets_are_random_and_accepted_by_the_service() -> None:
     assert new_secret() != new_secret()
     assert parse_webhook("https://receiver.example/", new_secret()) is not None
-    with pytest.raises(BadArgument, match="webhook_secret"):
-        verified({}, b"", secret="whsec_é!")
+
+
+@pytest.mark.parametrize("secret", ["whsec_é!", "", "whsec_", "whsec_" + base64.b64encode(b"k" * 23).decode()])
+def test_a_secret_that_anybody_could_guess_verifies_nothing(job: Job, secret: str) -> None:
+    body, stamp = message(job), f"m.{NOW}."
+    key = b"" if "é" in secret else base64.b64decode(secret.removeprefix("whsec_"))
+    digest = hmac.new(key, stamp.encode() + body, hashlib.sha256).digest()
+    signature = f"v1,{base64.b64encode(digest).decode()}"
+    forged = {"webhook-id": "m", "webhook-timestamp": str(NOW), "webhook-signature": signature}
+    with pytest.raises(BadArgument, match="secret: expected whsec_ followed by 24 bytes or more in base64"):
+        verified(forged, body, secret=secret, now=NOW)
 
 
 async def _submitted(service: InMemoryService, **given: str) -> None:

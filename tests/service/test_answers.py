@@ -160,6 +160,7 @@ def test_a_body_that_is_not_json_is_described(http: httpx.Client) -> None:
         422,
         "JSON (EOF while parsing a value at line 1 column 8)",
     )
+    assert answer.json()["got"] == """'{"days":'"""
 
 
 @pytest.mark.parametrize(("gibibytes", "parse"), [(3, 3), (8, 4)])

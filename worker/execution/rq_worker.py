@@ -94,6 +94,9 @@ class PliantWorker(Worker):
         Connection for heartbeats during a job. A hanging store delays supervision by the time limits of `quick` and `records`.
     """
 
+    max_connection_wait_time = float(IDLE_WAKE)
+    """Longest pause before the store is tried again, seconds; RQ doubles the pause with each outage since the worker's last job."""
+
     def __init__(
         self, *, settings: Settings, connection: redis.Redis, quick: redis.Redis, records: Records, queue: Queue,
         name: str,

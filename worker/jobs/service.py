@@ -78,9 +78,15 @@ class Jobs:
         TooManyQueued
             The owner's limit on queued jobs is reached.
         """
+        return self.submit_once(inputs_file, submission, interpretation=interpretation)[0]
+
+    def submit_once(
+        self, inputs_file: Path, submission: Submission, *, interpretation: Interpretation
+    ) -> tuple[Job, bool]:
+        """Accept a job as `submit`; return it, and whether it is new: False for that of an earlier or simultaneous equal request."""
         known = self.known(submission)
         if known is not None:
-            return known
+            return known, False
         job = Job(
             id=submission.id or new_job_id(),
             name=submission.name,
@@ -299,15 +305,15 @@ class Jobs:
 
         try:
             size = sum(self.blobs.get(key).size for key in copies.values())
-            return self._create(job, submission, copy, size=size, owner=source.owner, from_result=result is not None)
+            return self._create(job, submission, copy, size=size, owner=source.owner, from_result=result is not None)[0]
         except FileNotFoundError:
             raise UnknownJob(source.job.id) from None
 
     def _create(
         self, job: Job, submission: Submission, put: Callable[[str], object], *, size: int, owner: str | None = None,
         from_result: bool = False,
-    ) -> Job:  # fmt: skip
-        """Store a new job and queue it.
+    ) -> tuple[Job, bool]:  # fmt: skip
+        """Store a new job and queue it; return it and True, or the job of a simultaneous equal request and False.
 
         `put` stores `size` bytes: the inputs under the given blob key and, with `from_result`, the stored result beside them.
         `owner` defaults to the owner of these jobs.
@@ -329,7 +335,8 @@ class Jobs:
             max_running=self.max_running,
         )
         kept = acceptance.create(stored, put, max_queued=self.max_queued)
-        return self._placed(kept) if kept.inputs == stored.inputs else self._same(kept, submission, wanted=job.id)
+        new = kept.inputs == stored.inputs
+        return self._placed(kept) if new else self._same(kept, submission, wanted=job.id), new
 
     def _same(self, found: Stored, submission: Submission, *, wanted: str | None = None) -> Job:
         """Return the job of a repeated request; raise `Conflict` for a different one."""

@@ -16,7 +16,7 @@ from urllib.parse import unquote, urlsplit
 import obstore
 from obstore.exceptions import BaseError
 from obstore.store import MemoryStore, ObjectStore, S3Store, from_url
-from pliant.worker.errors import StoreUnavailable
+from pliant.worker.errors import InvalidSetting, StoreUnavailable
 from pliant.worker.store.calls import RemoteCalls
 
 logger = logging.getLogger(__name__)
@@ -112,6 +112,11 @@ class Blobs:
         """Open `file:///directory` (created if missing), `s3://bucket/prefix` or `memory:///`.
 
         An object store's credentials and endpoint are read from its usual environment variables (`AWS_…`).
+
+        Raises
+        ------
+        InvalidSetting
+            The text is not a URL.
         """
         if url.startswith("memory:"):
             return cls(MemoryStore())
@@ -120,7 +125,11 @@ class Blobs:
                 store = from_url(url, mkdir=True, automatic_cleanup=True)
                 return cls(store, directory=Path(unquote(urlsplit(url).path)))
             options: Any = {**CLIENT, **client_options(os.environ)}
-            return cls(from_url(url, client_options=options, retry_config=RETRIES), remote=True)
+            try:
+                return cls(from_url(url, client_options=options, retry_config=RETRIES), remote=True)
+            except ValueError:
+                expected = "file:///FOLDER or s3://BUCKET/PREFIX"
+                raise InvalidSetting("PLIANT_BLOB_URL", expected=expected, got=repr(url)) from None
 
     def put(self, key: str, file: Path, *, media_type: str = "application/octet-stream") -> int:
         """Store a file atomically; return its size in bytes.

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import redis
-from pliant.worker.errors import StoreUnavailable
+from pliant.worker.errors import InvalidSetting, StoreUnavailable
 from pliant.worker.store.calls import SilentServer
 from redis.backoff import ExponentialWithJitterBackoff
 from redis.client import Pipeline
@@ -56,16 +56,27 @@ def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | 
     After a broken connection it retries with growing pauses of up to 0.5 s. All writes are compare-and-set or idempotent, so a
     retry after a lost reply is harmless. Timeouts are not retried, since that would multiply the wait. `answer_within` is the time
     limit of a command, seconds; None: `ANSWER_WITHIN`, and `SilentServer` limits the commands sent to a silent server.
+
+    Raises
+    ------
+    InvalidSetting
+        The URL is malformed; the message does not show it, because it may hold a password.
     """
     seconds = ANSWER_WITHIN if answer_within is None else answer_within
-    client = (redis.Redis if answer_within is not None else _Client).from_url(
-        url,
-        decode_responses=decode,
-        socket_connect_timeout=min(CONNECT_WITHIN, seconds),
-        socket_timeout=seconds,
-        health_check_interval=15,
-        retry=Retry(ExponentialWithJitterBackoff(base=0.05, cap=0.5), retries, (redis.ConnectionError,)),
-    )
+    try:
+        client = (redis.Redis if answer_within is not None else _Client).from_url(
+            url,
+            decode_responses=decode,
+            socket_connect_timeout=min(CONNECT_WITHIN, seconds),
+            socket_timeout=seconds,
+            health_check_interval=15,
+            retry=Retry(ExponentialWithJitterBackoff(base=0.05, cap=0.5), retries, (redis.ConnectionError,)),
+        )
+    except ValueError:
+        raise InvalidSetting(
+            "PLIANT_REDIS_URL", expected="a URL redis://, rediss:// or unix://", got="another text",
+            hint="Percent-encode special characters of the password.",
+        ) from None  # fmt: skip
     if isinstance(client, _Client):
         client.server = _SILENCE.setdefault(url, SilentServer())
     return client
@@ -77,12 +88,11 @@ def check_server(url: str) -> str:
     Raises
     ------
     StoreUnavailable
-        The server does not answer or rejects the password, or the URL is malformed.
+        The server does not answer or rejects the password.
+    InvalidSetting
+        The URL is malformed.
     """
-    try:
-        client = connect(url, decode=True, retries=0, answer_within=3.0)
-    except ValueError as error:
-        raise StoreUnavailable("The job store", reason=str(error)) from error
+    client = connect(url, decode=True, retries=0, answer_within=3.0)
     try:
         with reachable():
             client.get("pliant:doctor")

@@ -161,7 +161,8 @@ class WebhookSender:
             body = message(stored.job)
             try:
                 async with asyncio.timeout(WITHIN):
-                    status = await self._post(stored.webhook, id=id, body=body)
+                    # The attempt's id, because a new job may have the id of a deleted one.
+                    status = await self._post(stored.webhook, id=f"msg_{stored.attempt_id}", body=body)
             except NotPublic as error:
                 await asyncio.to_thread(self._give_up, id, str(error))
             except _failures() as error:
@@ -188,7 +189,7 @@ class WebhookSender:
                 "Host": parts.netloc,
                 "Content-Type": "application/json",
                 "User-Agent": "Pliant-Webhook/1",
-                **signed(webhook.secret, id=f"msg_{id}", timestamp=int(self.clock()), body=body),
+                **signed(webhook.secret, id=id, timestamp=int(self.clock()), body=body),
             },
             # The certificate must match the host name, although the connection is made to the address.
             extensions={"sni_hostname": host, "timeout": httpx.Timeout(WITHIN).as_dict()},

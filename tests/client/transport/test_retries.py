@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
 
 import httpx
 import numpy as np
@@ -413,10 +416,40 @@ def test_addresses_and_ids_are_checked_before_anything_is_sent(clock: Clock) -> 
     for address in ("127.0.0.1:8000", "ftp://here", "http://"):
         with pytest.raises(BadArgument, match="Expected the address of a service"):
             Client(address)
-    service = InMemoryService()
-    with pytest.raises(BadArgument, match="Expected the id of a job"):
-        client_of(service, clock).get("../../secrets")
+    client = client_of(service := InMemoryService(), clock)
+    wrong: Any
+    for wrong in ("../../secrets", "", 5):
+        with pytest.raises(BadArgument, match="Expected the id of a job"):
+            client.get(wrong)
+        with pytest.raises(BadArgument, match="Expected the id of a job"):
+            client.submit(inputs_of=wrong)
     assert service.requests == []
+
+
+@pytest.mark.parametrize("key", ["", "a\nb", " a", "a ", "\ud800", "k" * 256, 5])
+def test_an_idempotency_key_is_checked_before_anything_is_sent(clock: Clock, key: Any) -> None:
+    client = client_of(service := InMemoryService(), clock)
+    for call in (
+        partial(client.submit, POINTS),
+        partial(client.retry, "a-job"),
+        partial(client.make_outputs, "a-job", "glb"),
+    ):
+        with pytest.raises(BadArgument, match="idempotency_key: expected 1 to 255 printable characters"):
+            call(idempotency_key=key)
+    assert service.requests == []
+
+
+def test_statuses_are_checked_before_anything_is_sent(clock: Clock) -> None:
+    client = client_of(service := InMemoryService(), clock)
+    for wrong in ("done", ["queued", "done"]):
+        with pytest.raises(BadArgument, match=r"statuses: 'done' is not a valid Status\. Choose from queued, running"):
+            list(client.list(statuses=wrong))
+    assert service.requests == []
+
+
+def test_a_name_that_is_not_utf8_is_sent(clock: Clock) -> None:
+    client = client_of(InMemoryService(), clock)
+    assert client.submit(POINTS, name=os.fsdecode(b"pr\xfcfung")).record.name == "pr?fung"
 
 
 def test_a_token_is_only_sent_in_the_header(clock: Clock) -> None:

@@ -304,6 +304,30 @@ def test_a_public_service_without_tokens_does_not_start(valkey_url: str, caplog:
     process.check_access(strict, Tokens(connect("unix:///nonexistent/x.sock", decode=True, retries=0), prefix="x"))
 
 
+@pytest.mark.parametrize(
+    ("name", "given", "sentence"),
+    [
+        ("REDIS_URL", "http://host", "PLIANT_REDIS_URL: expected a URL redis://"),
+        ("BLOB_URL", "/srv/blobs", "PLIANT_BLOB_URL: expected file:///FOLDER"),
+        ("BLOB_URL", "ftp://host", "The blob store is unavailable"),
+    ],
+)
+def test_a_service_whose_stores_cannot_be_opened_does_not_start(
+    name: str,
+    given: str,
+    sentence: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("PLIANT_DATA", str(tmp_path))
+    monkeypatch.setenv(f"PLIANT_{name}", given)
+    monkeypatch.setattr(process, "configure_logging", lambda *_: None)
+    monkeypatch.setattr(process, "prepare", lambda _: None)
+    assert process.main() == 2
+    assert capsys.readouterr().err.startswith(sentence)
+
+
 def test_a_token_is_ignored_if_authentication_is_off(running: Running, http: httpx.Client, tmp_path: Path) -> None:
     job = submit(http, name="anybody's")
     assert http.get(f"/v1/jobs/{job.id}", headers={"Authorization": "Bearer nonsense"}).status_code == 200

@@ -81,6 +81,12 @@ def test_on_loopback_only_loopback_hosts_are_accepted(running: Running, host: st
         assert answer.json()["code"] == "unknown_host"
 
 
+def test_a_service_on_another_loopback_address_is_reached_by_it(serve: Serve) -> None:
+    running = serve(host="127.0.0.2")
+    for host, status in (("127.0.0.2:8000", 200), ("localhost", 200), ("127.0.0.3", 421)):
+        assert httpx.get(f"{running.url}/v1/limits", headers={"Host": host}).status_code == status
+
+
 def test_only_the_listed_hosts_are_accepted(serve: Serve) -> None:
     running = serve(allowed_hosts=("Pliant.example:443",))  # as a Host header may spell it
     for host, status in (

@@ -14,6 +14,7 @@ import pytest
 from pliant.schemas.job import Job, Problem, Status
 from pliant.service.settings import MB
 from pliant.worker.formats import Limits, load_inputs
+from pliant.worker.jobs.service import Jobs
 from serving import Running, Serve, claim, form, heard, npz, submit, tracks, until
 
 
@@ -60,6 +61,7 @@ BAD: dict[str, tuple[dict[str, Any], int, str, str]] = {
     "priority": ({"priority": "urgent"}, 422, "invalid_priority", "priority"),
     "long name": ({"name": "n" * 201}, 422, "name_too_long", "name"),
     "long text": ({"name": "n" * (2**20 + 1)}, 413, "text_too_large", "name"),
+    "long options": ({"options": ("options.json", b" " * (2**20 + 1))}, 413, "text_too_large", "options"),
     "not UTF-8": ({"name": ("", b"\xff\xfe")}, 422, "not_utf8", "name"),
 }
 
@@ -84,6 +86,7 @@ def test_an_error_states_expected_and_got_and_nothing_is_kept(running: Running, 
     assert problem.got
     assert problem.hint
     assert problem.detail.endswith((".", ")"))
+    assert "frames" not in problem.hint or code != "text_too_large"
     assert running.waiting == before
     assert running.left_on_disk == []
 
@@ -208,6 +211,14 @@ def test_an_idempotency_key_makes_a_submission_repeatable(running: Running, http
     assert http.post("/v1/jobs", files=form(name="same")).json()["id"] != first.json()["id"]
 
 
+def test_an_idempotency_key_has_255_characters_in_any_script(running: Running, http: httpx.Client) -> None:
+    keys = [("ж" * 255).encode(), b"\xe9" * 255, ("ж" * 256).encode(), b""]
+    answers = [http.post("/v1/jobs", files=form(), headers=[(b"Idempotency-Key", key)]) for key in keys]
+    assert [each.status_code for each in answers] == [202, 202, 422, 422]
+    assert {each.json()["code"] for each in answers[2:]} == {"invalid_idempotency_key"}
+    assert running.left_on_disk == []
+
+
 def test_twenty_concurrent_repetitions_create_one_job(running: Running) -> None:
     found: list[str] = []
 
@@ -235,6 +246,16 @@ def test_put_uses_the_id_chosen_by_the_client(http: httpx.Client) -> None:
     odd = http.put("/v1/jobs/x", files=form())
     assert (odd.status_code, odd.json()["code"]) == (422, "invalid_id")
     assert http.put("/v1/jobs/a%2Fb", files=form()).status_code == 404
+
+
+def test_of_two_equal_puts_at_once_only_one_creates_the_job(
+    http: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Jobs, "known", lambda *_: None)  # neither finds the job of the other
+    answers = [http.put("/v1/jobs/both-at-once", files=form()) for _ in range(2)]
+    assert [each.status_code for each in answers] == [202, 200]
+    assert answers[0].json() == answers[1].json()
+    assert http.put("/v1/jobs/both-at-once", files=form(name="other")).json()["code"] == "id_taken"
 
 
 def test_pages_list_every_job_once_newest_first(serve: Serve) -> None:

@@ -295,7 +295,7 @@ def test_a_job_over_its_memory_limit_fails_as_out_of_memory(house: House, tmp_pa
         settled(lean)
 
 
-def test_invalid_arguments_and_settings_are_reported() -> None:
+def test_invalid_arguments_and_settings_are_reported(tmp_path: Path) -> None:
     def run(*arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "pliant.worker", *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, **env})
@@ -305,6 +305,14 @@ def test_invalid_arguments_and_settings_are_reported() -> None:
     unset = run("reconcile", PLIANT_WORKERS="none")
     assert (unset.returncode, unset.stderr.count("\n")) == (1, 1)
     assert "PLIANT_WORKERS: expected a whole number" in unset.stderr
+    for store, sentence in {
+        "http://host": "PLIANT_REDIS_URL: expected a URL redis://, rediss:// or unix://, got another text.",
+        "unix:///nowhere/none.sock": "The job store is unavailable (ConnectionError).",
+    }.items():
+        ended = run("work", PLIANT_REDIS_URL=store, PLIANT_DATA=str(tmp_path))
+        assert (ended.returncode, ended.stderr.count("\n"), ended.stderr.startswith(sentence)) == (1, 1, True), (
+            ended.stderr
+        )
 
 
 def test_the_fsck_command_reports_inconsistencies(house: House) -> None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import time
 
-from pliant.worker.execution.rq_worker import Delivery, PliantWorker
+import pytest
+import redis
+from pliant.worker.execution.rq_worker import ALIVE_FOR, IDLE_WAKE, Delivery, PliantWorker
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 from pliant.worker.store.queue import FUNCTION, RedisQueue
 from pliant.worker.store.redis import RedisRecords
+from rq.exceptions import DequeueTimeout
 from rq.serializers import JSONSerializer
 
 PAUSE = 3.0
@@ -41,4 +44,28 @@ def test_heartbeats_do_not_delay_supervision_while_the_server_hangs(settings: Se
     assert connection.hget(job.key, "last_heartbeat") > before
     assert worker.connection is connection
     for each in (connection, quick, text):
+        each.close()
+
+
+def test_an_idle_worker_returns_soon_after_each_of_many_outages(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    connection, text = connect(settings.redis, decode=False), connect(settings.redis, decode=True)
+    worker = PliantWorker(
+        settings=settings, connection=connection, quick=connection, records=RedisRecords(text, prefix=settings.queue),
+        queue=RedisQueue(connection, name=settings.queue), name="me",
+    )  # fmt: skip
+    outages = iter([redis.ConnectionError("away"), DequeueTimeout(0, "idle")] * 10)
+
+    def dequeued(*_: object, **__: object) -> None:
+        for each in outages:
+            raise each
+
+    pauses: list[float] = []
+    monkeypatch.setattr(worker.queue_class, "dequeue_any", dequeued)
+    monkeypatch.setattr("rq.worker.base.time.sleep", pauses.append)
+    assert worker.dequeue_job_and_maintain_ttl(IDLE_WAKE) is None
+    assert len(pauses) == 10
+    assert max(pauses) < ALIVE_FOR / 2
+    for each in (connection, text):
         each.close()

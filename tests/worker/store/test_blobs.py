@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from obstore.store import MemoryStore
-from pliant.worker.errors import StoreUnavailable
+from pliant.worker.errors import InvalidSetting, StoreUnavailable
 from pliant.worker.store.blobs import CHUNK, CLIENT, SWITCHES, TEXTS, Blobs, client_options
 from pliant.worker.store.calls import AT_ONCE, WAITING, RemoteCalls
 from serving import until
@@ -211,3 +211,10 @@ def test_connection_variables_are_passed_to_the_store(monkeypatch: pytest.Monkey
     monkeypatch.setattr("pliant.worker.store.blobs.from_url", opened)
     Blobs.open("s3://bucket/prefix")
     assert given == {**CLIENT, **client_options(variables)}
+
+
+def test_a_path_is_not_the_url_of_a_blob_store() -> None:
+    with pytest.raises(
+        InvalidSetting, match="PLIANT_BLOB_URL: expected file:///FOLDER or s3://BUCKET/PREFIX, got '/srv/blobs'"
+    ):
+        Blobs.open("/srv/blobs")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import redis
-from pliant.worker.errors import StoreUnavailable
-from pliant.worker.store.connection import reachable
+from pliant.worker.errors import InvalidSetting, StoreUnavailable
+from pliant.worker.store.connection import check_server, connect, reachable
 
 
 @pytest.mark.parametrize(
@@ -27,3 +27,11 @@ def test_a_server_that_cannot_serve_is_unavailable(fault: redis.RedisError, reas
 def test_command_errors_pass_through_unchanged() -> None:
     with pytest.raises(redis.ResponseError, match="WRONGTYPE"), reachable():
         raise redis.ResponseError("WRONGTYPE of a key")
+
+
+@pytest.mark.parametrize("url", ["http://host", "redis://:pass/word@host", "redis://host:many"])
+def test_a_malformed_url_is_an_invalid_setting_and_not_shown(url: str) -> None:
+    for opened in (lambda: connect(url, decode=True), lambda: check_server(url)):
+        with pytest.raises(InvalidSetting, match=r"^PLIANT_REDIS_URL: expected a URL redis://") as caught:
+            opened()
+        assert "pass" not in str(caught.value).replace("password", "")

@@ -149,7 +149,7 @@ def test_the_end_of_a_job_is_sent_once_with_signature_and_body(
     assert path == "/hook?x=1"
     assert headers["host"] == f"127.0.0.1:{receiver.port}"
     assert headers["content-type"] == "application/json"
-    assert headers["webhook-id"] == f"msg_{job.id}"
+    assert headers["webhook-id"] == f"msg_{door.records.get(job.id).attempt_id}"
     assert abs(int(headers["webhook-timestamp"]) - time.time()) < 10
     content = f"{headers['webhook-id']}.{headers['webhook-timestamp']}.".encode() + body
     digest = hmac.new(b"k" * 32, content, hashlib.sha256).digest()
@@ -169,7 +169,9 @@ def test_a_failed_delivery_is_repeated_with_the_same_id(
     job = made(receiver.url)
     webhook_sender.start()
     until(lambda: pending(webhook_sender.outbox) == 0)
-    assert [headers["webhook-id"] for _, headers, _ in receiver.got] == [f"msg_{job.id}"] * 3
+    assert [headers["webhook-id"] for _, headers, _ in receiver.got] == [
+        f"msg_{door.records.get(job.id).attempt_id}"
+    ] * 3
     assert {path for path, _, _ in receiver.got} == {"/hook?x=1"}, "a redirect is not followed"
     assert len({body for _, _, body in receiver.got}) == 1
     log = door.log(job.id)
@@ -423,7 +425,20 @@ def test_a_retried_job_sends_its_webhook_and_a_job_without_one_does_not(
     assert pending(webhook_sender.outbox) == 2
     webhook_sender.start()
     until(lambda: len(receiver.got) == 2 and pending(webhook_sender.outbox) == 0)
-    assert {headers["webhook-id"] for _, headers, _ in receiver.got} == {f"msg_{again.id}", f"msg_{again.retry_of}"}
+    assert len({headers["webhook-id"] for _, headers, _ in receiver.got}) == 2
+
+
+def test_a_new_job_with_the_id_of_a_deleted_one_sends_another_message(
+    door: Jobs, receiver: Receiver, webhook_sender: WebhookSender, inputs_file: Path, interpretation: Interpretation
+) -> None:
+    hooked = Submission(options=Options(), id="take-1", webhook=Webhook(url=receiver.url, secret=SECRET))
+    webhook_sender.start()
+    for number in (1, 2):
+        door.submit(inputs_file, hooked, interpretation=interpretation)
+        door.cancel("take-1")
+        until(lambda: pending(webhook_sender.outbox) == 0)
+        door.delete("take-1")
+        assert len({headers["webhook-id"] for _, headers, _ in receiver.got}) == number
 
 
 def test_retry_pauses_increase_and_sum_to_about_a_day() -> None:
