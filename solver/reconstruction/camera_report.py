@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.model.marginal_likelihood import UNLIKELY
-from pliant.solver.records import Choices, FocalCandidate
+from pliant.solver.records import Choices, FocalCandidate, KnownCamera
 from pliant.solver.refinement.focal_length import MIN_PERSPECTIVE_GAIN
 from pliant.solver.settings import Settings
 
@@ -16,7 +16,7 @@ DIVERGED = "the depths of the points diverge with it"
 
 
 def with_camera_choice(
-    choices: Choices, view: Perspective | None, settings: Settings, *, unit: float, given: bool
+    choices: Choices, view: Perspective | None, settings: Settings, *, unit: float, known: KnownCamera | None
 ) -> Choices:
     """Return the choices with camera model, its reason, the focal lengths compared, and whether the sign of depth is known.
 
@@ -30,9 +30,10 @@ def with_camera_choice(
         Settings of the solve.
     unit : float
         One normalized unit in the tracks' unit.
-    given : bool
-        Whether rotations were given, which determine the sign of depth.
+    known : KnownCamera, optional
+        Given cameras, which determine the sign of depth; None if they were estimated.
     """
+    given = known is not None
     plain = settings.camera if settings.camera == "orthographic" else "scaled_orthographic"
     if view is None:
         return replace(choices, camera=plain, depth_sign="settled" if given else "ambiguous")
@@ -43,14 +44,14 @@ def with_camera_choice(
         )
         for each in view.candidates
     )
-    warning = improbable(view, unit)
+    warnings = improbable(view, unit), unknown_centre_warning(view, settings, known)
     return replace(
         choices,
         camera="perspective" if view.bends else plain,
         depth_sign="settled" if given or (view.bends and view.settled) else "ambiguous",
         focal_candidates=candidates,
         reasons={**choices.reasons, "camera_model": described(view, unit)},
-        warnings=choices.warnings if warning is None else (*choices.warnings, warning),
+        warnings=(*choices.warnings, *(each for each in warnings if each is not None)),
     )
 
 
@@ -86,3 +87,11 @@ def improbable(view: Perspective, unit: float) -> str | None:
     other = "orthography" if best == 0 else f"a focal length of {unit / abs(best):.4g}"
     gains = f"{other} gains {own - nll[best]:.3f} in the log likelihood per point and frame"
     return f"The given focal length, {unit / view.given:.4g}, is improbable: {gains if own < UNLIKELY else DIVERGED}."
+
+
+def unknown_centre_warning(view: Perspective, settings: Settings, known: KnownCamera | None) -> str | None:
+    """Return a sentence if the principal point of a perspective camera is a guess; None otherwise."""
+    given = settings.centre is not None or (known is not None and known.principal_point is not None)
+    if given or not view.bends:
+        return None
+    return "Perspective was found, but the picture's centre is unknown and taken to be the middle of the tracks. Give image_size."

@@ -111,7 +111,7 @@ def _finished(
     tracks, normalized = observations.tracks, observations.normalized
     outcome = Outcome.STOPPED if monitor() else outcome
     choices = with_camera_choice(
-        start.choices, estimate.perspective, start.settings, unit=normalized.unit, given=observations.known is not None
+        start.choices, estimate.perspective, start.settings, unit=normalized.unit, known=observations.known
     )
     monitor.enter("finish")
     monitor()

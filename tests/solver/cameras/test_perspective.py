@@ -7,7 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pliant.solver import Camera, InvalidInput, InvalidSettings, KnownCamera, Settings, Solution, Tracks, gallery, solve
+from pliant.solver import (
+    Camera,
+    Choices,
+    InvalidInput,
+    InvalidSettings,
+    KnownCamera,
+    Settings,
+    Solution,
+    Tracks,
+    gallery,
+    solve,
+)
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.cameras.perspective import (
     Candidate,
@@ -24,7 +35,7 @@ from pliant.solver.evaluation.metrics import e3d_frame_scaled, focal_error, repr
 from pliant.solver.model.marginal_likelihood import UNLIKELY
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
-from pliant.solver.reconstruction.camera_report import described, improbable
+from pliant.solver.reconstruction.camera_report import described, improbable, with_camera_choice
 from pliant.solver.refinement.focal_length import corrected_energy
 from pliant.solver.refinement.learned import Learned, motion_of
 from pliant.solver.shapes import perspective_shapes
@@ -379,6 +390,30 @@ def test_the_reported_gain_is_that_of_the_given_focal_length() -> None:
     assert "gains 0.100 in" in described(view, 100.0)
     assert "gains 0.400 in" in str(improbable(view, 100.0))
     assert improbable(replace(view, candidates=candidates[:1]), 100.0) is None  # stopped before its own was compared
+
+
+def test_an_unknown_picture_centre_is_a_warning_where_perspective_is_found() -> None:
+    view = Perspective(
+        np.zeros((8, 2)), CENTRE, given=None, signs=(1, -1), required=False, curvature=0.1,
+        candidates=(Candidate(0.1, 0.5), Candidate(0.0, 1.0)),
+    )  # fmt: skip
+    orbit = FACE.rotations, np.ones(8)
+    choices = Choices(1, 0.1, 0.1, 0.1, 1, 0.0, "uniform", 100.0, 0.1)
+
+    def warnings(settings: Settings, known: KnownCamera | None = None, *, found: Perspective = view) -> tuple[str, ...]:
+        return with_camera_choice(choices, found, settings, unit=100.0, known=known).warnings
+
+    unknown = ((Settings(), None), (Settings(), KnownCamera.from_arrays(*orbit, focal=FOCAL)))
+    for settings, known in unknown:
+        assert ["the picture's centre is unknown" in each for each in warnings(settings, known)] == [True]
+    lens = KnownCamera.from_arrays(*orbit, focal=FOCAL, principal_point=(639.5, 359.5))
+    for settings, known in (
+        (Settings(image_size=PICTURE), None),
+        (Settings(principal_point=(600.0, 300.0)), None),
+        (Settings(), lens),
+    ):
+        assert warnings(settings, known) == ()
+    assert warnings(Settings(), found=replace(view, curvature=0.0)) == ()
 
 
 def test_a_given_focal_length_with_which_the_depths_diverge_has_no_figure_in_the_report() -> None:
