@@ -70,10 +70,15 @@ def random_walk(num_frames: int, ordered: bool = True) -> Floats:
 
 def random_walk_at(used: NDArray[np.intp], num_frames: int, ordered: bool = True) -> Floats:
     """Return T restricted to the frames used, shape `(F', F')`, in time and memory linear in F."""
-    bands, norm = walk_bands(num_frames, ordered)
     columns = np.zeros((num_frames, len(used)))
-    columns[used, np.arange(len(used))] = 1 / norm
-    return np.asarray(solveh_banded(np.stack([np.append(0.0, bands[1, :-1]), bands[0]]), columns)[used])
+    columns[used, np.arange(len(used))] = 1.0
+    return walked(columns, ordered)[used]
+
+
+def walked(columns: Floats, ordered: bool = True) -> Floats:
+    """Return T times columns of shape `(F, k)`, in time and memory linear in F."""
+    bands, norm = walk_bands(len(columns), ordered)
+    return np.asarray(solveh_banded(np.stack([np.append(0.0, bands[1, :-1]), bands[0]]), columns / norm))
 
 
 @lru_cache(maxsize=8)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.model.image_density import ImageModel
 from pliant.solver.model.marginal_likelihood import root_matrix
-from pliant.solver.model.random_walk import random_walk, random_walk_at, walk_bands
+from pliant.solver.model.random_walk import random_walk, random_walk_at, walk_bands, walked
 from pliant.solver.operators.gauss_markov import PathPrior
 from pliant.solver.records import Floats
 from scipy import linalg
@@ -68,6 +68,11 @@ class ShapeCovariance:
         modes = self.modes[used]
         walk = random_walk_at(used, len(self.modes), self.ordered)
         return np.asarray(modes @ modes.T + self.walk_variance * walk)
+
+    def times(self, columns: Floats) -> Floats:
+        """Return C times columns of shape `(F, n)`, in time and memory linear in F."""
+        deformed = self.modes @ (self.modes.T @ columns)
+        return np.asarray(deformed + self.walk_variance * walked(columns, self.ordered))
 
     def of_image(self, projections: Floats, used: NDArray[np.intp] | None = None) -> Floats:
         """Return V = ΠΣΠᵀ + σ²I, shape `(2F, 2F)`; `projections` (F, 2, 3) are s_f times the first two rows of R_f.

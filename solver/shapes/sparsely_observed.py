@@ -158,28 +158,37 @@ class Kriging:
     """Simple kriging: the conditional mean of a point's path, given its observations and a trend."""
 
     problem: Problem
+    covariance: ShapeCovariance
     translations: Floats
 
-    reach: Floats
-    """Σ Πᵀ, covariance between path and images, shape `(3F, 2F)`."""
+    mean: Floats
+    """Covariance of a path with its own mean, C 1 / F, shape `(F,)`."""
 
-    image: Floats
-    """Π Σ Πᵀ, shape `(2F, 2F)`."""
-
-    scatter: float
-    """Variance of an inlier about its prediction."""
+    near: Floats
+    """Variance of a path's mean about the surface along each axis, shape `(3,)`."""
 
     @classmethod
     def of(cls, problem: Problem, covariance: ShapeCovariance, translations: Floats) -> Kriging:
-        """Compute the covariances, which all points share."""
-        frames, rows = len(problem.points), problem.projections.astype(np.float64)
-        moving = covariance.over_frames()
-        near = MEAN_VARIANCE_SHARE * (moving.mean() + covariance.axes()[1])
-        moving = moving - moving.mean(axis=0) - moving.mean(axis=1)[:, None] + moving.mean()  # about a path's mean
-        each = moving + near[:, None, None]
-        reach = np.einsum("gic,cfg->fcgi", rows, each).reshape(3 * frames, 2 * frames)
-        image = np.einsum("fic,fcm->fim", rows, reach.reshape(frames, 3, -1)).reshape(2 * frames, 2 * frames)
-        return cls(problem, translations, reach, image, max(covariance.noise_variance, (MIN_OUTLIER_DISTANCE / 3) ** 2))
+        """Compute what all points share."""
+        mean = covariance.times(np.full((len(problem.points), 1), 1 / len(problem.points)))[:, 0]
+        return cls(problem, covariance, translations, mean, MEAN_VARIANCE_SHARE * (mean.mean() + covariance.axes()[1]))
+
+    @property
+    def scatter(self) -> float:
+        """Variance of an inlier about its prediction."""
+        return max(self.covariance.noise_variance, (MIN_OUTLIER_DISTANCE / 3) ** 2)
+
+    def columns(self, frames: NDArray[np.intp]) -> Floats:
+        """Return the covariance over frames of a path about its mean, with the positions in n of them, shape `(F, n)`."""
+        unit = np.zeros((len(self.mean), len(frames)))
+        unit[frames, np.arange(len(frames))] = 1.0
+        return np.asarray(self.covariance.times(unit) - self.mean[frames] - self.mean[:, None] + self.mean.mean())
+
+    def image(self, frames: NDArray[np.intp], columns: Floats) -> Floats:
+        """Return Π Σ Πᵀ of n frames, shape `(2n, 2n)`."""
+        rows = self.problem.projections[frames].reshape(-1, 3).astype(np.float64)
+        moving = np.repeat(np.repeat(columns[frames], 2, axis=0), 2, axis=1)
+        return np.asarray((rows @ rows.T) * moving + (rows * self.near) @ rows.T)
 
     def left(self, point: int, path: Floats) -> Floats:
         """Return the residuals, shape `(F, 2, 1)`, of a point for a path `(F, 3, 1)`."""
@@ -188,19 +197,21 @@ class Kriging:
 
     def moved(self, point: int, confidence: Floats, trend: Floats) -> Floats:
         """Return the conditional mean path, `(F, 3, 1)`, given a trend and observations with confidence `(F, 1)`."""
-        weights = self.problem.weights
-        there = np.repeat(confidence[:, 0] > 0, 2)
-        if not there.any():
+        weights, there = self.problem.weights, np.flatnonzero(confidence[:, 0] > 0)
+        if len(there) == 0:
             return trend
-        off, path = self.left(point, trend).reshape(-1)[there], trend
+        off, path, columns = self.left(point, trend)[there].reshape(-1), trend, self.columns(there)
+        image, rows = self.image(there, columns), self.problem.projections[there].astype(np.float64)
         for _ in range(PATH_REWEIGHTINGS):
             omega = loss_weights(
                 self.left(point, path), confidence, loss=self.problem.loss, scale=weights.robust_scale
-            ).reshape(-1)[there]
-            matrix = self.image[np.ix_(there, there)]
+            )[there].reshape(-1)
+            matrix = image.copy()
             matrix[np.diag_indices_from(matrix)] *= 1 + PATH_RIDGE
             matrix[np.diag_indices_from(matrix)] += weights.temporal / np.maximum(omega, SMALLEST_WEIGHT)
-            path = trend + (self.reach[:, there] @ linalg.solve(matrix, off, assume_a="pos")).reshape(trend.shape)
+            weighed = linalg.solve(matrix, off, assume_a="pos").reshape(-1, 2)
+            pulled = np.einsum("gi,gic->gc", weighed, rows)
+            path = trend + (columns @ pulled + self.near * pulled.sum(axis=0))[:, :, None]
         return path
 
     def inconsistent(self, point: int, confidence: Floats, trend: Floats) -> NDArray[np.intp]:
@@ -210,10 +221,11 @@ class Kriging:
         Bᵢ⁻¹ yᵢ, and its squared Mahalanobis length is yᵢᵀ Bᵢ⁻¹ yᵢ (Dubrule 1983).
         """
         off, there = self.left(point, trend)[:, :, 0], np.flatnonzero(confidence[:, 0] > 0)
+        image = self.image(there, self.columns(there)).reshape(len(there), 2, len(there), 2)
         while len(there):
-            rows = np.stack([2 * there, 2 * there + 1], axis=1).ravel()
             each = np.arange(len(there))
-            inverse = np.linalg.inv(self.image[np.ix_(rows, rows)] + self.scatter * np.eye(len(rows)))
+            square = image.reshape(2 * len(there), -1)
+            inverse = np.linalg.inv(square + self.scatter * np.eye(len(square)))
             blocks = inverse.reshape(len(there), 2, len(there), 2)[each, :, each]
             weighed = (inverse @ off[there].reshape(-1)).reshape(-1, 2)
             apart = np.linalg.solve(blocks, weighed[:, :, None])[:, :, 0]
@@ -221,7 +233,7 @@ class Kriging:
             worst = int(deviation.argmax())
             if deviation[worst] <= MAX_DEVIATION**2:
                 break
-            there = np.delete(there, worst)
+            there, image = np.delete(there, worst), np.delete(np.delete(image, worst, axis=0), worst, axis=2)
         return np.setdiff1d(np.flatnonzero(confidence[:, 0] > 0), there)
 
 

@@ -189,7 +189,7 @@ def test_every_random_generator_uses_the_seed_of_the_settings(monkeypatch: pytes
         return original(seed)  # type: ignore[arg-type]
 
     few = Tracks.from_arrays(MADE.tracks.points[:, :14])
-    many = gallery.face(4, 150, degrees=60)
+    many = gallery.face(4, 300, degrees=60)
     visible = original(0).random(many.tracks.visible.shape) > 0.2
     monkeypatch.setattr(np.random, "default_rng", seeded)
     settings = Settings(seed=7, max_reweightings=2)

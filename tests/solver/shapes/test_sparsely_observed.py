@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from pliant.solver.evaluation import metrics
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.shapes.sparsely_observed import (
     MAX_DEVIATION,
+    MEAN_VARIANCE_SHARE,
     MIN_OUTLIER_DISTANCE,
     SURFACE_RIDGE,
     WELL_OBSERVED_SHARE,
@@ -111,9 +114,58 @@ def test_a_constant_mode_equals_a_larger_mean_position_covariance(seed: int) -> 
         Kriging.of(problem, ShapeCovariance(a, axis_covariance, m, 1e-3, 1e-4, 0.0), np.zeros((frames, 2)))  # type: ignore[arg-type]
         for a, m in ((mean_covariance, np.hstack([modes, mode])), (mean_covariance + share * axis_covariance, modes))
     )
-    for name in ("reach", "image"):
-        expected = getattr(one, name)
-        np.testing.assert_allclose(getattr(other, name), expected, atol=1e-9 * np.abs(expected).max())
+    shown = np.sort(random.choice(frames, int(random.integers(1, frames)), replace=False))
+    for expected, found in (
+        (one.columns(shown), other.columns(shown)),
+        (one.image(shown, one.columns(shown)), other.image(shown, other.columns(shown))),
+    ):
+        np.testing.assert_allclose(found, expected, atol=1e-9 * max(np.abs(expected).max(), 1))
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_covariances_of_the_shown_frames_are_those_of_all_frames(seed: int) -> None:
+    """Compared with ΠΣΠᵀ and Σ about a path's mean, written out for all frames."""
+    random = np.random.default_rng(seed)
+    frames = int(random.integers(3, 12))
+    root = random.normal(size=(3, 3))
+    covariance = ShapeCovariance(
+        np.diag(random.uniform(0.1, 1, 3)), root @ root.T + 0.1 * np.eye(3), random.normal(size=(frames, 2)),
+        1e-3, 1e-4, 0.0, ordered=bool(random.integers(2)),
+    )  # fmt: skip
+    rows = random.normal(size=(frames, 2, 3))
+    problem = SimpleNamespace(points=np.zeros((frames, 2, 1)), projections=rows)
+    kriging = Kriging.of(problem, covariance, np.zeros((frames, 2)))  # type: ignore[arg-type]
+    centre = np.eye(frames) - 1 / frames
+    moving = centre @ covariance.over_frames() @ centre
+    near = MEAN_VARIANCE_SHARE * (covariance.over_frames().mean() + covariance.axes()[1])
+    sigma = np.einsum("fg,cd->fcgd", moving, np.eye(3)) + np.einsum("c,cd->cd", near, np.eye(3))[None, :, None]
+    image = np.einsum("fic,fcgd,gjd->figj", rows, sigma, rows)
+    shown = np.sort(random.choice(frames, int(random.integers(1, frames)), replace=False))
+    columns = kriging.columns(shown)
+    np.testing.assert_allclose(columns, moving[:, shown], atol=1e-9)
+    expected = image[shown][:, :, shown].reshape(2 * len(shown), -1)
+    np.testing.assert_allclose(kriging.image(shown, columns), expected, atol=1e-9)
+
+
+def test_memory_for_rarely_seen_points_is_linear_in_the_frames() -> None:
+    random = np.random.default_rng(0)
+    peaks = []
+    for frames in (1000, 4000):
+        covariance = ShapeCovariance(np.eye(3), np.eye(3), random.normal(size=(frames, 5)), 1e-3, 1e-4, 0.0)
+        problem = SimpleNamespace(
+            points=random.normal(size=(frames, 2, 1)), projections=random.normal(size=(frames, 2, 3)), loss="l2",
+            weights=SimpleNamespace(temporal=1e-3, robust_scale=1.0),
+        )  # fmt: skip
+        confidence = np.zeros((frames, 1))
+        confidence[::100] = 1.0
+        tracemalloc.start()
+        kriging = Kriging.of(problem, covariance, np.zeros((frames, 2)))  # type: ignore[arg-type]
+        path = kriging.moved(0, confidence, np.zeros((frames, 3, 1)))
+        peaks.append(tracemalloc.get_traced_memory()[1] / int(confidence.sum()))
+        tracemalloc.stop()
+        assert np.isfinite(path).all()
+    assert peaks[1] < 6 * peaks[0]
+    assert peaks[1] < 1e6
 
 
 @pytest.mark.slow
@@ -147,8 +199,11 @@ def test_the_worst_observation_is_rejected_first(seed: int) -> None:
     off[random.random(frames) < 0.3] += 3.0
     confidence = (random.random((frames, 1)) < 0.8).astype(float)
     path = np.zeros((frames, 3, 1))
-    problem = SimpleNamespace(points=off[:, :, None], projections=np.zeros((frames, 2, 3)))
-    kriging = Kriging(problem, np.zeros((frames, 2)), np.zeros((18, 12)), image, scatter)  # type: ignore[arg-type]
+    kriging = Mock(spec=Kriging, scatter=scatter)
+    kriging.left.return_value = off[:, :, None]
+    kriging.image.side_effect = lambda there, _: image.reshape(frames, 2, frames, 2)[there][:, :, there].reshape(
+        2 * len(there), -1
+    )
     left = np.flatnonzero(confidence[:, 0] > 0).tolist()
     while left:
         deviation = []
@@ -163,7 +218,7 @@ def test_the_worst_observation_is_rejected_first(seed: int) -> None:
             break
         left.pop(int(np.argmax(deviation)))
     gone = np.setdiff1d(np.flatnonzero(confidence[:, 0] > 0), left)
-    np.testing.assert_array_equal(kriging.inconsistent(0, confidence, path), gone)
+    np.testing.assert_array_equal(Kriging.inconsistent(kriging, 0, confidence, path), gone)
 
 
 def test_a_patch_attached_to_an_edge_stays_bounded() -> None:
