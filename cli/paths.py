@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -45,8 +44,9 @@ def mesh_file(mesh: str | None) -> None:
         The text is none of these.
     """
     from pliant.client.errors import BadArgument
+    from pliant.client.input_files import mesh_text
 
-    if mesh is None or re.fullmatch(r"none|\s*\d{1,6}\s*x\s*\d{1,6}\s*", mesh.lower()) is not None:
+    if mesh is None or mesh_text(mesh) is not None:
         return
     if not Path(mesh).exists():
         raise BadArgument(

@@ -62,8 +62,8 @@ def mesh_part(mesh: Source | tuple[int, int], folder: Path) -> Path | str:
     BadArgument
         The mesh is neither faces, nor a file, nor such a text.
     """
-    if isinstance(mesh, str) and re.fullmatch(r"none|\s*\d{1,6}\s*x\s*\d{1,6}\s*", mesh.lower()) is not None:
-        return mesh.lower().replace(" ", "")
+    if isinstance(mesh, str) and (text := mesh_text(mesh)) is not None:
+        return text
     if isinstance(mesh, str | Path):
         return existing_file(mesh, "mesh")
     if isinstance(mesh, tuple) and len(mesh) == 2 and all(isinstance(size, Integral) for size in mesh):
@@ -71,6 +71,12 @@ def mesh_part(mesh: Source | tuple[int, int], folder: Path) -> Path | str:
     if isinstance(mesh, Mapping):
         return _npz(folder / "mesh.npz", {str(key): _array(value, str(key)) for key, value in mesh.items()})
     return _npz(folder / "mesh.npz", {"faces": _array(mesh, "mesh")})
+
+
+def mesh_text(mesh: str) -> str | None:
+    """Return a grid size as ``"12x20"``, or ``"none"``; None for another text, which is a path."""
+    word = "".join(mesh.lower().split()).replace("×", "x")
+    return word if re.fullmatch(r"none|[0-9]{1,6}x[0-9]{1,6}", word) is not None else None
 
 
 def region_part(region: Region, folder: Path) -> Path:

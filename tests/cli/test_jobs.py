@@ -129,6 +129,10 @@ def test_result_can_fetch_a_single_file(run: Run, tracks: Path, tmp_path: Path) 
     assert [path.name for path in (tmp_path / "some").iterdir()] == ["report.json"]
 
 
+def test_a_grid_size_may_be_written_with_a_multiplication_sign(run: Run, tracks: Path) -> None:
+    assert submitted(run, tracks, "--mesh", "3×4")["interpretation"]["mesh_grid"] == [3, 4]
+
+
 def test_an_empty_name_is_the_default(run: Run, tracks: Path) -> None:
     assert submitted(run, tracks, "--name", "")["name"] == tracks.stem
 
