@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from pliant.client.errors import BadArgument
-from pliant.schemas.job import Status
+from pliant.schemas.job import LONGEST_KEY, Status
 from pliant.schemas.outputs import OutputRequest
 from pliant.schemas.shares import DAY, ShareRequest
 from pliant.schemas.validation import expectation
@@ -42,10 +42,6 @@ def sharing(days: float) -> ShareRequest:
         return ShareRequest(expires_in=round(days * DAY))
     except (ValidationError, OverflowError, ValueError) as fault:
         raise BadArgument(f"days: expected a minute (0.0007) to 366 days, got {days!r}.") from fault
-
-
-LONGEST_KEY = 255
-"""Maximum length of an idempotency key, characters."""
 
 
 def key_header(idempotency_key: str) -> dict[str, str]:

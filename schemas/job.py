@@ -14,6 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 HEARTBEAT_SECONDS = 15.0
 """Seconds between two comments of an event stream in which nothing happens, unless the operator sets another period."""
 
+LONGEST_KEY = 255
+"""Maximum length of an idempotency key, characters."""
+
 
 class Status(StrEnum):
     """Status of a job. The last three are final and never change."""

@@ -147,7 +147,7 @@ def test_covariances_of_the_shown_frames_are_those_of_all_frames(seed: int) -> N
     np.testing.assert_allclose(kriging.image(shown, columns), expected, atol=1e-9)
 
 
-def test_memory_for_rarely_seen_points_is_linear_in_the_frames() -> None:
+def test_memory_for_a_rarely_seen_point_is_proportional_to_the_frames_and_its_observations() -> None:
     random = np.random.default_rng(0)
     peaks = []
     for frames in (1000, 4000):
