@@ -78,7 +78,7 @@ PYTEST := $(PYTHON_TESTS) $(SHARED)
 NEEDY := slow or chromium or node or s3 or root
 
 # Services and pages wait for a third of their time. What only computes fills it, in as many processes of low priority.
-COMPUTING := tests/solver tests/tracking
+COMPUTING := tests/solver tests/tracking tests/benchmarks
 ASIDE := build/computing.log
 define ALL_TESTS
 @mkdir -p build
@@ -90,7 +90,7 @@ endef
 RUN_TESTS = $(if $(TESTS)$(filter 1,$(PROCESSES)),$(PYTEST) -m "$(1)" $(TESTS),$(ALL_TESTS))
 
 test: $(STAMP)
-	$(call RUN_TESTS,not ($(NEEDY)))
+	$(call RUN_TESTS,not ($(NEEDY) or long))
 
 test-slow: $(STAMP) $(PAGE)
 	$(call RUN_TESTS,($(NEEDY)) and not long)
@@ -110,7 +110,7 @@ matrix:
 	  else echo "== Python $$version is not on this machine"; fi; done
 
 coverage: $(STAMP)
-	$(PYTEST) -m "not ($(NEEDY))" --cov=pliant --cov-report=term $(TESTS)
+	$(PYTEST) -m "not ($(NEEDY) or long)" --cov=pliant --cov-report=term $(TESTS)
 
 # Zensical builds what docs/generate.py writes: the pages, and the reference that is read from the code.
 docs: $(STAMP) build/typed/pliant

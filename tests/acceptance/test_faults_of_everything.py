@@ -24,8 +24,11 @@ WANTED = (
     "cancel_exporting",
 )  # fmt: skip
 
-AGAIN = {"valkey_down", "api_uploading", "frozen", "stopped", "cancel_loading"}
-"""Faults that are also covered by `tests/hosts`, by stopping a worker (`tests/worker`) or by cancelling in another state."""
+AGAIN = {
+    "valkey_down", "api_uploading", "api_receiving", "frozen", "stopped", "job_process_storing",
+    "cancel_loading", "cancel_cameras", "cancel_exporting",
+}  # fmt: skip
+"""Faults that are also covered by `tests/hosts`, by stopping a worker (`tests/worker`), or in another state."""
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -122,6 +122,7 @@ def test_the_folders_of_the_authors_code_are_found(bench, code) -> None:
         peers.paths(peers.PEERS["pnd2"], code)
 
 
+@pytest.mark.slow
 def test_each_run_is_measured_once_even_if_it_failed(bench, octave, data, code, tmp_path, capsys) -> None:
     peers, out = bench("accuracy.peers"), tmp_path / "peers.jsonl"
     given = ["--data", str(data), "--code", str(code), "--out", str(out), "--methods"]

@@ -68,6 +68,7 @@ def test_every_folder_and_module_named_has_constants() -> None:
     assert {module.rsplit(".", 1)[1] for module, _ in found} >= set(sensitivity.ELSEWHERE)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_each_solve_runs_once_and_the_table_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "sensitivity.jsonl"

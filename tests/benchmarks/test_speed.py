@@ -31,6 +31,7 @@ def speed(*arguments: str) -> list[str]:
     return ran.stdout.splitlines()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_every_baseline_is_timed_beside_the_solver():
     lines = speed("compare", "--frames", "6", "--points", "80", "--cap", "60")
@@ -64,6 +65,7 @@ def test_growth_prints_a_row_per_size_and_the_exponents():
     assert sum(line.startswith("exponent in F of") for line in lines) == 3
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_measurements_of_growth_are_appended_to_a_file(tmp_path):
     results = tmp_path / "growth.jsonl"

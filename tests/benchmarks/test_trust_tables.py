@@ -89,6 +89,7 @@ def recorded_sheet(folder: Path) -> None:
     (folder / "rolled" / "about.json").write_text(json.dumps({"units": "pixels", "image_size": [640, 480]}))
 
 
+@pytest.mark.slow
 def test_other_methods_on_a_sheet_are_measured_once_and_tabulated(bench, tmp_path, capsys) -> None:
     sheets = bench("accuracy.sheets")
     recorded_sheet(tmp_path / "data")

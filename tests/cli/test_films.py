@@ -151,7 +151,9 @@ def test_a_folder_of_pictures_is_sent_as_a_zip_that_depends_only_on_them(tmp_pat
     submitting = [tmp_path / "first"], [tmp_path / "first", tmp_path / "second"]
     for given in submitting:
         ran = CliRunner().invoke(
-            app, ["submit", *map(str, given), "--wait", "--json"], obj=Session(transport=InMemoryService(steps=1))
+            app,
+            ["submit", *map(str, given), "--wait", "--json", *QUICK],
+            obj=Session(transport=InMemoryService(steps=1)),
         )
         assert ran.exit_code == 0, ran.output
         jobs = [json.loads(ran.stdout)] if len(given) == 1 else [row["job"] for row in json.loads(ran.stdout)]

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 WITHOUT = """
 import sys
@@ -33,6 +34,7 @@ def run(code: str, *arguments: str, folder: Path) -> subprocess.CompletedProcess
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
 
 
+@pytest.mark.slow
 def test_without_unix_modules_the_sdk_imports_and_npz_files_are_solved(tmp_path: Path) -> None:
     random = np.random.default_rng(3)
     np.savez(tmp_path / "tracks.npz", tracks=random.normal(size=(16, 2)) * 50 + random.normal(size=(5, 16, 2)))

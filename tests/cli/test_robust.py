@@ -285,6 +285,7 @@ def test_demo_replaces_files_in_a_named_folder_only_if_forced(
         assert json.loads(ran.stderr)["detail"] == f"rendered into {folder}", more
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_demo_ends_with_its_service_when_its_terminal_or_process_is_ended(
     tmp_path: Path, number: signal.Signals

@@ -45,6 +45,7 @@ def test_an_example_without_arguments_prints_its_usage(script: str) -> None:
     assert "Traceback" not in ran.stderr
 
 
+@pytest.mark.slow
 def test_from_cotracker(run, tmp_path: Path) -> None:
     points = SEQUENCE.tracks.points[None].astype(np.float32)
     np.savez(tmp_path / "tracks.npz", pred_tracks=points, pred_visibility=np.ones(points.shape[:3], bool))

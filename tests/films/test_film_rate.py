@@ -40,6 +40,7 @@ def solved(film: Path, folder: Path, *, fps: float | None) -> tuple[Finished, di
         return done, report["options"], float(tracks["fps"])
 
 
+@pytest.mark.slow
 def test_the_rate_is_that_of_the_tracked_frames(uneven: Path, tmp_path: Path) -> None:
     done, reported, rate = solved(uneven, tmp_path, fps=None)
     stated = check_film(FilmSource(uneven), Options()).fps
@@ -50,6 +51,7 @@ def test_the_rate_is_that_of_the_tracked_frames(uneven: Path, tmp_path: Path) ->
     assert done.interpretation.image_size == "96x72"
 
 
+@pytest.mark.slow
 def test_a_rate_that_the_job_sets_is_kept_even_if_the_file_states_the_same(uneven: Path, tmp_path: Path) -> None:
     stated = check_film(FilmSource(uneven), Options()).fps
     done, reported, rate = solved(uneven, tmp_path, fps=stated)

@@ -82,6 +82,7 @@ def test_a_killed_host_loses_nothing(hosts: Hosts) -> None:
     assert times[0] < LEASE + 6
 
 
+@pytest.mark.long
 def test_a_cut_cable_loses_nothing_and_the_stale_attempt_writes_nothing(hosts: Hosts) -> None:
     id = hosts.submit()
     host = hosts.host_of(id)
@@ -116,6 +117,7 @@ def test_redis_cut_off_for_longer_than_a_lease_moves_no_job(hosts: Hosts) -> Non
     row("Redis is cut off while S3 stays")
 
 
+@pytest.mark.long
 def test_a_redis_restart_during_a_job_moves_no_job(hosts: Hosts) -> None:
     id = hosts.submit()
     hosts.host_of(id)

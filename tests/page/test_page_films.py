@@ -282,7 +282,7 @@ def inspected(page: Page, url: str, finished: str, **fields: Any) -> None:
     page.route("**/v1/inspect", lambda route: route.fulfill(json=seen))
 
 
-@pytest.mark.parametrize("name", ["film.webm", "moving.zip", "moving.gif"])
+@pytest.mark.parametrize("name", ["film.webm", pytest.param("moving.zip", marks=pytest.mark.long), "moving.gif"])
 def test_a_region_is_drawn_on_another_frame(
     filming: Page, url: str, films: dict[str, bytes], finished: str, name: str
 ) -> None:
@@ -314,7 +314,9 @@ def test_a_region_is_drawn_on_another_frame(
     assert len(sent_options(filming)["region_polygon"]) > 3
 
 
-@pytest.mark.parametrize("frames", [None, 5, 8])
+@pytest.mark.parametrize(
+    "frames", [None, pytest.param(5, marks=pytest.mark.long), pytest.param(8, marks=pytest.mark.long)]
+)
 def test_frames_without_certain_numbers_cannot_be_chosen(
     filming: Page, url: str, films: dict[str, bytes], finished: str, frames: int | None
 ) -> None:
@@ -335,7 +337,15 @@ def mask(*, inside: int = 255) -> bytes:
     return bytes(cv2.imencode(".png", marked)[1])
 
 
-@pytest.mark.parametrize("order", ["film first", "mask first", "together", "chosen"])
+@pytest.mark.parametrize(
+    "order",
+    [
+        pytest.param("film first", marks=pytest.mark.long),
+        "mask first",
+        pytest.param("together", marks=pytest.mark.long),
+        "chosen",
+    ],
+)
 def test_a_picture_beside_a_film_is_its_region(
     filming: Page, url: str, films: dict[str, bytes], finished: str, order: str
 ) -> None:
@@ -409,7 +419,7 @@ def test_a_mask_of_another_size_is_refused_beside_the_film(page: Page, url: str,
     expect(page.locator("[data-part=film]").get_by_role("alert")).to_contain_text("320×240 pixels", timeout=60_000)
 
 
-@pytest.mark.parametrize("name", ["make.py", "mesh.obj"])
+@pytest.mark.parametrize("name", [pytest.param("make.py", marks=pytest.mark.long), "mesh.obj"])
 def test_a_file_that_does_not_belong_to_a_film_is_left_out(filming: Page, films: dict[str, bytes], name: str) -> None:
     drop(filming, {"film.webm": films["film.webm"]})
     filming.get_by_role("button", name="Draw a region").click()
@@ -502,7 +512,10 @@ def test_a_film_that_the_browser_cannot_show_is_sent_without_a_region(
 def test_the_services_first_frame_is_used_if_the_browser_cannot_decode(
     filming: Page, url: str, films: dict[str, bytes], finished: str, name: str
 ) -> None:
-    """The browser's own frame takes precedence, whichever arrives first; corners are in the film's pixels."""
+    """The browser's own frame takes precedence, whichever arrives first; corners are in the film's pixels.
+
+    The points of the running job move over it.
+    """
     small = bytes(cv2.imencode(".jpg", np.full((HEIGHT // 2, WIDTH // 2, 3), BLUE, np.uint8))[1])
     seen = {
         **film_record(url, finished)["interpretation"],
@@ -517,7 +530,9 @@ def test_the_services_first_frame_is_used_if_the_browser_cannot_decode(
     shown.wait_for()
     pixel = shown.evaluate("(it) => [...it.getContext('2d').getImageData(4, 4, 1, 1).data]")
     assert (pixel[2] > 150) == (name == "old.mp4")
-    answer_with(filming, film_record(url, finished))
+    record = film_record(url, finished)
+    followed = {"frame": 3, "seconds": 0.6, "width": WIDTH, "height": HEIGHT, "points": [160, 120, 170, 130]}
+    answer_with(filming, {**record, "progress": {**record["progress"], "followed": followed}})
     filming.get_by_role("button", name="Draw a region").click()
     filming.get_by_role("button", name="Rectangle").click()
     drag(filming, (0.25, 0.25), (0.75, 0.5))
@@ -526,6 +541,13 @@ def test_the_services_first_frame_is_used_if_the_browser_cannot_decode(
     expect(filming.get_by_text("Tracking the film")).to_be_visible()
     (left, top), _, (right, bottom), _ = sent_options(filming)["region_polygon"]
     assert np.allclose([left, top, right, bottom], [80, 60, 240, 120], atol=2)
+    if name == "old.mp4":
+        expect(
+            filming.get_by_text("The picture stays at the first frame: this browser cannot decode the film.")
+        ).to_be_visible()
+        live = filming.get_by_role("img", name="The film with its tracked points")
+        corner = live.evaluate("(it) => [...it.getContext('2d').getImageData(4, 4, 1, 1).data]")
+        assert corner[2] > 150 > corner[0], corner
 
 
 def test_a_service_without_films_offers_no_film_input(page: Page, url: str) -> None:

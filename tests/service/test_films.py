@@ -87,6 +87,7 @@ def test_a_film_becomes_a_job_with_tracks_and_shapes(running: Running, http: htt
         assert held["tracks"].shape == (10, done.interpretation.num_points, 2)
 
 
+@pytest.mark.slow
 @forked
 def test_a_finished_job_has_the_rate_of_the_tracked_frames(
     running: Running, http: httpx.Client, tmp_path: Path
@@ -100,6 +101,7 @@ def test_a_finished_job_has_the_rate_of_the_tracked_frames(
     assert job.interpretation.fps == job.options.fps
 
 
+@pytest.mark.slow
 def test_a_film_without_a_region_succeeds_with_a_warning(running: Running, http: httpx.Client, film: bytes) -> None:
     done = work(running, send(http, film, options=QUICK).id)
     assert done.status is Status.SUCCEEDED, done.error
@@ -217,6 +219,7 @@ def test_a_film_that_cannot_be_tracked_fails_its_job_with_a_remedy(
     assert "pattern" in done.error.detail
 
 
+@pytest.mark.slow
 @forked
 def test_cancelling_stops_the_tracking(running: Running, http: httpx.Client, tmp_path: Path) -> None:
     long = films.write_film(tmp_path / "long.mkv", films.textured_pictures(150, (320, 240)))

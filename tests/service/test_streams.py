@@ -333,6 +333,7 @@ def process(
     started.wait(10)
 
 
+@pytest.mark.slow
 def test_sigterm_ends_streams_and_waits_promptly_and_cleanly(
     process: tuple[subprocess.Popen[bytes], str, Path],
 ) -> None:
@@ -382,6 +383,7 @@ raise SystemExit(main())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("process", [("-c", STOPPED_BETWEEN_LOOK_AND_WAIT)], indirect=True, ids=["between"])
 def test_a_stream_between_check_and_wait_still_ends_on_shutdown(
     process: tuple[subprocess.Popen[bytes], str, Path],

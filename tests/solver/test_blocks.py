@@ -83,6 +83,7 @@ def test_solving_in_blocks_matches_solving_at_once(film: gallery.Sequence, setti
     assert fractions[-1] == 1
 
 
+@pytest.mark.slow
 def test_cameras_of_blocks_with_sparsely_observed_points_see_the_tracks_in_perspective(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -36,7 +36,7 @@ def test_the_largest_confidence_counts_as_1() -> None:
     assert relative(visible, 1.0) is visible
 
 
-@pytest.mark.parametrize("prior", [pytest.param("gaussian", marks=pytest.mark.slow), "smooth"])
+@pytest.mark.parametrize("prior", [pytest.param("gaussian", marks=[pytest.mark.slow, pytest.mark.long]), "smooth"])
 def test_a_common_factor_of_all_confidences_changes_nothing(prior: str) -> None:
     settings = Settings(prior=prior, max_reweightings=5, basis_size=2)
     whole, part = (solve(at(each), FACE.mesh, settings=settings) for each in (1.0, 0.25))

@@ -139,6 +139,7 @@ def test_the_view_of_points_lies_in_the_picture(
     assert view_of(tracks, visible, (100, 50)) == view
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_threads(turning: tuple[Path, RenderedFilm], tracked: TrackedFilm) -> None:
     path, film = turning
     before = cv2.getNumThreads()

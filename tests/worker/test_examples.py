@@ -46,6 +46,7 @@ def test_the_error_for_an_unknown_example_lists_the_known_ones(name: str, file: 
         example_file(name, file)
 
 
+@pytest.mark.slow
 def test_the_example_film_shows_a_face_inside_its_region(tmp_path: Path) -> None:
     pytest.importorskip("cv2")
     from pliant.tracking import open_film

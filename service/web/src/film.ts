@@ -42,8 +42,17 @@ export async function firstFrame(file: File): Promise<ImageBitmap | null> {
   }
 }
 
-/** Return the first frame as the service decoded it, enlarged to the film's resolution, or null if the response has none. */
-export async function servedFrame({ first_frame, image_size }: Inspection): Promise<ImageBitmap | null> {
+/** The inspections of films, kept for those that this browser cannot decode. */
+const inspections = new WeakMap<File, Inspection>();
+
+/** Keep the first frame in the inspection of a film for `servedFrame`. */
+export function keepServed(film: File, seen: Inspection): void {
+  inspections.set(film, seen);
+}
+
+/** Return the first frame as the service decoded it, enlarged to the film's resolution, or null if the service has not sent one. */
+export async function servedFrame(film: File): Promise<ImageBitmap | null> {
+  const { first_frame, image_size } = inspections.get(film) ?? {};
   const [width, height] = (image_size ?? "").split("x").map(Number);
   if (!first_frame || !width || !height) return null;
   const jpeg = Uint8Array.from(atob(first_frame), (letter) => letter.charCodeAt(0));

@@ -1,9 +1,10 @@
 // The job of a film while it is tracked: the film's picture immediately, and the points as the service reports them.
 //
-// The browser decodes the picture from the file that this tab has sent; after a reload only the points are available.
+// The browser decodes the picture from the file that this tab has sent. Where it cannot, the points move over the first frame,
+// which the service decoded before the job was submitted. After a reload only the points are available.
 
 import { h, say } from "./dom";
-import { firstFrame } from "./film";
+import { firstFrame, servedFrame } from "./film";
 import { sentFile } from "./sent";
 import type { Job } from "./types";
 
@@ -18,6 +19,8 @@ export class LiveTracks {
   private url = "";
   private followed: Followed | null = null;
   private started = false;
+  /** Whether the picture is the first frame as the service decoded it. */
+  private still = false;
 
   constructor(private readonly id: string) {
     new ResizeObserver(() => this.draw()).observe(this.element);
@@ -36,7 +39,8 @@ export class LiveTracks {
     const followed = progress?.followed ?? null;
     if (followed && followed.frame !== this.followed?.frame) this.move(followed);
     const count = this.followed ? this.followed.points.length / 2 : 0;
-    say(this.words, count > 0 ? `Frame ${this.followed?.frame}: ${count} of the tracked points.` : "The points appear as soon as they are tracked.");
+    const still = this.still ? " The picture stays at the first frame: this browser cannot decode the film." : "";
+    say(this.words, count > 0 ? `Frame ${this.followed?.frame}: ${count} of the tracked points.${still}` : "The points appear as soon as they are tracked.");
   }
 
   close(): void {
@@ -51,9 +55,11 @@ export class LiveTracks {
   private async begin(): Promise<void> {
     const film = sentFile(this.id, "film");
     if (film === undefined) return this.draw();
-    this.picture = await firstFrame(film);
+    const decoded = await firstFrame(film);
+    this.picture = decoded ?? (await servedFrame(film).catch(() => null)); // not a picture after all
+    this.still = decoded === null && this.picture !== null;
     this.draw();
-    if (/\.(gif|zip)$/i.test(film.name) || this.picture === null) return;
+    if (/\.(gif|zip)$/i.test(film.name) || decoded === null) return;
     const video = h("video", { muted: true, playsinline: true, preload: "auto" });
     video.muted = true;
     this.url = URL.createObjectURL(film);

@@ -2,7 +2,7 @@
 
 import { CameraDialog, canRecord } from "./camera";
 import { button, h, say, uniqueId } from "./dom";
-import { looksLikeFilm, looksLikePicture, looksLikeTracks, servedFrame } from "./film";
+import { keepServed, looksLikeFilm, looksLikePicture, looksLikeTracks, servedFrame } from "./film";
 import { Filming } from "./filming";
 import { type Entry, describe, isReadable, peek } from "./peek";
 import type { Point } from "./region";
@@ -129,8 +129,10 @@ export class Slots {
   /** Take the interpretation of the current files: the number of a film's frames, and the first one for browsers that cannot decode it. */
   async seen(seen: Inspection): Promise<void> {
     const film = this.file("film");
-    if (film) this.filming.count(film, seen.given_frames ?? 0);
-    const picture = film && (await servedFrame(seen).catch(() => null)); // not a picture after all
+    if (film === null) return;
+    this.filming.count(film, seen.given_frames ?? 0);
+    keepServed(film, seen);
+    const picture = await servedFrame(film).catch(() => null); // not a picture after all
     if (picture) this.filming.offer(film, picture);
   }
 

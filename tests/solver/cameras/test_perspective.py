@@ -288,6 +288,7 @@ def test_given_cameras_may_be_perspective(given_cameras: Solution) -> None:
     assert e3d_frame_scaled(found.shapes, SEEN) < 0.03
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_unknown_scales_barely_increase_the_error_under_perspective(given_cameras: Solution) -> None:
     cameras = KnownCamera.from_arrays(FACE.rotations, focal=FOCAL, principal_point=(639.5, 359.5))
@@ -295,6 +296,7 @@ def test_unknown_scales_barely_increase_the_error_under_perspective(given_camera
     assert e3d_frame_scaled(found.shapes, SEEN) < 1.1 * e3d_frame_scaled(given_cameras.shapes, SEEN)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_smooth_prior_supports_a_perspective_camera() -> None:
     found = solve(

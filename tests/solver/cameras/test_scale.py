@@ -20,6 +20,7 @@ def missed(found: np.ndarray, truth: np.ndarray) -> float:
     return float(np.std(np.log(found / truth)))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_scales_of_a_zooming_camera_are_recovered() -> None:
     film = gallery.face(12, 60, scale_change=0.1)
@@ -42,6 +43,7 @@ def test_a_camera_that_does_not_zoom_has_scales_of_one(name: str) -> None:
     assert found.choices.reasons["scales"].startswith("Every scale is 1")
 
 
+@pytest.mark.slow
 def test_implausibly_large_scale_changes_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     film = gallery.face(6, 30, scale_change=0.1)
     # Neither the rigid scales nor those found with the shapes may vary more.

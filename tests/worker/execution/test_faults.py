@@ -91,6 +91,7 @@ def test_a_running_job_is_cancelled(house: House) -> None:
     assert house.blobs_of(id) == {"inputs.npz"}
 
 
+@pytest.mark.slow
 def test_a_killed_job_process_fails_its_job_and_nothing_else(house: House) -> None:
     other = house.submit(long=True)
     house.solving(other)
@@ -163,6 +164,7 @@ def test_an_attempt_that_lost_its_job_writes_nothing(house: House) -> None:
     settled(house)
 
 
+@pytest.mark.slow
 def test_a_stopping_worker_requeues_its_job(house: House) -> None:
     id = house.submit(long=True)
     house.solving(id)
@@ -295,6 +297,7 @@ def test_a_job_over_its_memory_limit_fails_as_out_of_memory(house: House, tmp_pa
         settled(lean)
 
 
+@pytest.mark.slow
 def test_invalid_arguments_and_settings_are_reported(tmp_path: Path) -> None:
     def run(*arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "pliant.worker", *arguments]
@@ -315,6 +318,7 @@ def test_invalid_arguments_and_settings_are_reported(tmp_path: Path) -> None:
         )
 
 
+@pytest.mark.slow
 def test_the_fsck_command_reports_inconsistencies(house: House) -> None:
     command = [sys.executable, "-m", "pliant.worker", "fsck"]
     env = {**os.environ, **house.settings.to_environment()}

@@ -138,6 +138,7 @@ def test_hdf5_with_external_data_or_huge_declared_size_is_refused(tmp_path: Path
     assert code_of(tmp_path / "huge.mat") == "too_large"
 
 
+@pytest.mark.slow
 def test_a_file_that_exceeds_the_sandbox_time_or_memory_is_refused(tmp_path: Path) -> None:
     (tmp_path / "m.obj").write_text("v 1 2 3\n" * 4_000_000)  # several seconds on any machine; the limit is one
     limits = Limits(parse_seconds=1, max_points=10**8)

@@ -115,6 +115,7 @@ def test_an_internal_error_is_not_an_input_error(all_apart: None, tmp_path: Path
         store_inputs(tracks=tmp_path / "t.npz", options=Options(), target=tmp_path / "nowhere" / "x.npz")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_isolated_reading_keeps_no_memory_in_the_parent(tmp_path: Path) -> None:
     path = tmp_path / "t.npz"

@@ -49,6 +49,7 @@ def test_a_job_survives_an_outage_of_the_store(tmp_path: Path, inputs_files: tup
         settled(house)
 
 
+@pytest.mark.slow
 def test_killing_valkey_loses_no_job(tmp_path: Path, inputs_files: tuple[Path, Path]) -> None:
     settings = Settings(data=tmp_path, workers=2, threads=1)
     with House(settings, own_valkey=True, inputs=inputs_files) as house:
@@ -140,6 +141,7 @@ def test_killing_the_supervisor_ends_all_and_loses_no_job(tmp_path: Path, inputs
         settled(house)
 
 
+@pytest.mark.slow
 def test_a_full_disk_fails_the_job_and_the_next_one_succeeds(
     small_disk: Path, tmp_path: Path, valkey_data: Path, inputs_files: tuple[Path, Path]
 ) -> None:
