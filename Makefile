@@ -82,7 +82,7 @@ COMPUTING := tests/solver tests/tracking tests/benchmarks
 ASIDE := build/computing.log
 define ALL_TESTS
 @mkdir -p build
-@nice -n 5 $(PYTEST) --timeout=900 -p no:cacheprovider -m "$(1)" $(COMPUTING) >$(ASIDE) 2>&1 & computing=$$!; \
+@nice -n 10 $(PYTEST) --timeout=900 -p no:cacheprovider -m "$(1)" $(COMPUTING) >$(ASIDE) 2>&1 & computing=$$!; \
 trap 'kill $$computing' INT TERM; \
 $(PYTEST) -m "$(1)" $(COMPUTING:%=--ignore=%); failed=$$?; \
 wait $$computing || failed=$$?; cat $(ASIDE); exit $$failed

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 from typing import Annotated, Literal
 
 from pliant.schemas.job import HEARTBEAT_SECONDS
 from pliant.worker.environment import read
 from pliant.worker.logs import LogFormat, LogLevel
-from pydantic import BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 MB = 2**20
@@ -25,6 +26,22 @@ def _split(given: object) -> object:
 
 
 Listed = Annotated[tuple[str, ...], BeforeValidator(_split), Field(description="names, separated by commas")]
+
+_ORIGIN = re.compile(r"https?://[^/?#@]+")
+
+
+def _origins(given: tuple[str, ...]) -> tuple[str, ...]:
+    """Write origins as browsers send them: in lower case, without a slash at the end."""
+    origins = tuple(each.removesuffix("/").lower() for each in given)
+    for each in origins:
+        if _ORIGIN.fullmatch(each) is None:
+            raise ValueError(f"{each} is not an origin")
+    return origins
+
+
+Origins = Annotated[
+    Listed, AfterValidator(_origins), Field(description="origins such as https://example.org, separated by commas")
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +76,7 @@ class ServiceSettings:
     auth: Auth = "auto"
     """Whether a request needs a token: `required`, `off`, or `auto`, which is off on the loopback address and required on any
     other."""
-    cors_origins: Listed = ()
+    cors_origins: Origins = ()
     """Origins whose pages may call the service, separated by commas; empty: none."""
     trusted_proxies: Listed = ()
     """Addresses or networks of proxies whose `X-Forwarded-For` is trusted, separated by commas; `*` for any. Empty: none,

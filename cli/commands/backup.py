@@ -47,9 +47,10 @@ def restore(
     """Restore a backup into an installation without jobs and tokens; jobs that had not ended are queued again."""
     ctx.obj.json = as_json
     require_server("pliant restore")
-    from pliant.worker.maintenance.backup import restore_backup
+    from pliant.worker.maintenance.backup import read_manifest, restore_backup
     from pliant.worker.processes.valkey import attended
 
+    read_manifest(source)  # before a new installation is created for it
     settings = chosen(data, None)
     with attended(settings):
         summary = restore_backup(settings, source)

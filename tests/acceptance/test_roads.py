@@ -121,6 +121,8 @@ def test_solve_and_the_service_give_bit_identical_results(service_url: str, tmp_
         "-O",
         "max_reweightings=6",
         "-O",
+        "surface=free",
+        "-O",
         "outputs=glb,ply,obj,usd,mat,csv",
         "-O",
         "colours=error",

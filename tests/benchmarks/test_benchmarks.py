@@ -57,6 +57,7 @@ def write_case(folder: Path) -> None:
     (folder / "about.json").write_text(json.dumps({"units": "pixels"}))
 
 
+@pytest.mark.long
 def test_accuracy_runs_resume_without_remeasuring(tmp_path, run_here):
     write_case(tmp_path / "data" / "tiny")
     results = tmp_path / "cells.jsonl"
@@ -222,6 +223,7 @@ def test_pictures_show_what_the_camera_saw(bench, y_up: bool) -> None:
     assert (alone.truth, alone.relative, alone.quantity) == (None, None, "reprojection residual")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("given", ["mesh and truth", "tracks alone"])
 def test_pictures_are_drawn_with_or_without_mesh_and_truth(tmp_path: Path, given: str) -> None:
     from PIL import Image

@@ -66,6 +66,7 @@ def test_invalid_films_and_parts_are_rejected_with_a_message(film: Path, tmp_pat
     assert "other files and addresses are never opened" in " ".join(ran.output.split())
 
 
+@pytest.mark.slow
 def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
     def inspect(*arguments: object) -> Result:
         return CliRunner().invoke(app, ["inspect", *map(str, arguments)], env={"COLUMNS": "200"})

@@ -517,3 +517,10 @@ def test_errors_end_with_where_they_are_explained(run: Run, tracks: Path, tmp_pa
     ran = run("solve", tracks, "--frobnicate")
     assert ran.exit_code == Exit.USAGE
     assert "Try 'pliant solve --help' for help." in words(ran), "usage errors lead to the reference of the command"
+
+
+def test_restoring_what_is_no_backup_creates_nothing(tmp_path: Path) -> None:
+    ran = CliRunner().invoke(app, ["restore", str(tmp_path / "missing"), "--data", str(tmp_path / "data")])
+    assert ran.exit_code != 0
+    assert "holds no backup" in ran.output
+    assert list(tmp_path.iterdir()) == []

@@ -83,6 +83,7 @@ def test_from_tapnext(run, tmp_path: Path, model: str) -> None:
     assert (tmp_path / "face.glb").read_bytes()[:4] == b"glTF"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_from_alltracker(run, tmp_path: Path) -> None:
     frames, height, width = 5, 24, 32
@@ -106,6 +107,7 @@ def test_from_alltracker(run, tmp_path: Path) -> None:
     assert (tmp_path / "face.glb").read_bytes()[:4] == b"glTF"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_from_mat(run, tmp_path: Path) -> None:
     frames, points, _ = SEQUENCE.tracks.points.shape

@@ -149,7 +149,8 @@ def share(url: str, job: str, **body: int) -> tuple[str, datetime]:
 
 
 @pytest.mark.parametrize(
-    ("locale", "words"), [("de-DE", "%-d. November %Y um 17:00"), ("en-US", "%B %-d, %Y at 7:00 AM")]
+    ("locale", "words"),
+    [("de-DE", "%-d. November %Y um 17:00"), pytest.param("en-US", "%B %-d, %Y at 7:00 AM", marks=pytest.mark.long)],
 )
 def test_share_link_expiry_is_in_local_time(browser: Browser, url: str, finished: str, locale: str, words: str) -> None:
     link, _ = share(url, finished, expires_in=86400)

@@ -20,6 +20,7 @@ MORE_SEEDS = (*sorted(set(range(24)) - {*SEEDS, *SLOW_SEEDS}), 45, 91)
 """Further sequences of every kind."""
 
 
+@pytest.mark.slow
 def test_points_dropped_by_completion_do_not_break_the_solve() -> None:
     tracks = gallery.sphere(5, 20).tracks  # completion keeps 16 points, which used to be compared with all 20
     assert np.isfinite(solve(tracks, settings=Settings(basis_size=1)).shapes).all()

@@ -70,6 +70,7 @@ def test_temporal_smoothness_recovers_depth_unlike_the_pseudo_inverse() -> None:
     assert 0.001 < deep < 0.1
 
 
+@pytest.mark.slow
 def test_the_same_call_converges_to_the_same_bits() -> None:
     """With the default settings, estimated cameras and a mesh, whether progress is reported or not."""
     face = gallery.face(4, 12, mesh="triangles")

@@ -397,6 +397,7 @@ def test_very_long_films_have_a_contact_sheet(tmp_path: Path, size: tuple[int, i
     assert picture.shape == (2 * shape[0], 3 * shape[1], 3)
 
 
+@pytest.mark.slow
 def test_points_outside_the_picture_are_hidden(tmp_path: Path) -> None:
     """The texture moves out to the right; in the second pass, repeated pixels of the border look like what has left."""
     path = films.write_film(tmp_path / "film.mkv", films.textured_pictures(16, (160, 120), step=4))

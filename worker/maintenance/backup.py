@@ -109,7 +109,7 @@ def restore_backup(settings: Settings, source: Path) -> Summary:
     StoreUnavailable
         A store does not answer.
     """
-    manifest = _manifest(source)
+    manifest = read_manifest(source)
     records, rest = _verified(source, manifest)
     prepare(settings)
     snapshot, jobs = Snapshot(settings), Jobs.open(settings)
@@ -173,7 +173,16 @@ def _queue_again(jobs: Jobs, stored: Stored) -> None:
         jobs.queue.push(stored.job.id, stored.attempt_id)
 
 
-def _manifest(source: Path) -> dict[str, Any]:
+def read_manifest(source: Path) -> dict[str, Any]:
+    """Return what a backup says about itself.
+
+    Raises
+    ------
+    BadBackup
+        There is no backup, or one of another layout.
+    NewerData
+        The backup was written by a newer version.
+    """
     try:
         manifest: dict[str, Any] = json.loads((source / "manifest.json").read_text(encoding="utf-8"))
         known = manifest["format"] == FORMAT

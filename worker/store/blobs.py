@@ -116,7 +116,7 @@ class Blobs:
         Raises
         ------
         InvalidSetting
-            The text is not a URL.
+            The text is not a URL, or one of another kind of store.
         """
         if url.startswith("memory:"):
             return cls(MemoryStore())
@@ -126,6 +126,8 @@ class Blobs:
                 return cls(store, directory=Path(unquote(urlsplit(url).path)))
             options: Any = {**CLIENT, **client_options(os.environ)}
             try:
+                if urlsplit(url).scheme != "s3":
+                    raise ValueError(url)
                 return cls(from_url(url, client_options=options, retry_config=RETRIES), remote=True)
             except ValueError:
                 expected = "file:///FOLDER or s3://BUCKET/PREFIX"

@@ -278,6 +278,14 @@ def test_a_preflight_needs_no_token_and_errors_are_readable_across_origins(serve
     assert "access-control-allow-origin" not in strange.headers
 
 
+def test_allowed_origins_are_written_as_browsers_send_them(valkey_url: str) -> None:
+    read = settings_from(CORS_ORIGINS="https://Good.example/, http://localhost:3000")
+    assert read.cors_origins == ("https://good.example", "http://localhost:3000")
+    for wrong in ("good.example", "https://good.example/page", "*"):
+        with pytest.raises(InvalidSetting, match="PLIANT_CORS_ORIGINS: expected origins such as "):
+            settings_from(CORS_ORIGINS=wrong)
+
+
 def test_tokens_are_required_by_default_except_on_loopback(valkey_url: str) -> None:
     def asks(**env: str) -> bool:
         return settings_from(**env).asks_for_tokens

@@ -102,6 +102,7 @@ def test_a_sheet_is_recovered_despite_hidden_points_and_outliers() -> None:
     assert verdict.surface.outliers[~judged].mean() < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_order_of_the_frames_has_no_effect() -> None:
     sheet = rolled(frames=5, side=5)

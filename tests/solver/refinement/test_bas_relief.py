@@ -149,6 +149,7 @@ def nearby(head: Sequence, noise: float = 0.0) -> Tracks:
     return gallery.corrupt_tracks(tracks, noise=noise, seed=0)[0]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_perspective_is_the_same_at_twice_the_depth_and_twice_the_focal_length(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where a prior determines the depth, the focal length follows, and is no better known than the depth."""

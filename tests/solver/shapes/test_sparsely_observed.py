@@ -70,6 +70,7 @@ def test_a_hole_in_the_face_is_closed(cameras: KnownCamera | None) -> None:
     )
 
 
+@pytest.mark.slow
 def test_sparsely_observed_points_match_their_observations() -> None:
     """Seen in 3 of 16 frames, the patch passes through its observations and is closer to the truth than an unseen one."""
     drawn, seldom = (

@@ -105,6 +105,7 @@ def test_contradictory_inputs_are_rejected_before_a_file_is_written(inputs: Inpu
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_long_job_of_the_fault_tests_is_long_by_construction() -> None:
     """Every reweighting uses all inner iterations and lowers the energy, so all 1000 of them run on any machine."""

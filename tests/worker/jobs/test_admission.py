@@ -48,7 +48,9 @@ print(sequence.tracks.num_points, int(peak[1]) * 1024)
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads kilobytes")
-@pytest.mark.parametrize(("frames", "points", "prior"), [(8, 500, "gaussian"), (10, 20_000, "smooth")])
+@pytest.mark.parametrize(
+    ("frames", "points", "prior"), [pytest.param(8, 500, "gaussian", marks=pytest.mark.long), (10, 20_000, "smooth")]
+)
 def test_the_memory_estimate_is_within_a_factor_of_two_of_a_real_job(frames: int, points: int, prior: str) -> None:
     env = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     command = [sys.executable, "-c", MEASURE, str(frames), str(points), prior]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import secrets
 import shutil
 import socket
@@ -213,8 +214,8 @@ def test_connection_variables_are_passed_to_the_store(monkeypatch: pytest.Monkey
     assert given == {**CLIENT, **client_options(variables)}
 
 
-def test_a_path_is_not_the_url_of_a_blob_store() -> None:
-    with pytest.raises(
-        InvalidSetting, match="PLIANT_BLOB_URL: expected file:///FOLDER or s3://BUCKET/PREFIX, got '/srv/blobs'"
-    ):
-        Blobs.open("/srv/blobs")
+@pytest.mark.parametrize("url", ["/srv/blobs", "ftp://host/blobs", "s3://[bucket/blobs"])
+def test_blob_stores_of_other_kinds_are_refused(url: str) -> None:
+    expected = "PLIANT_BLOB_URL: expected file:///FOLDER or s3://BUCKET/PREFIX, got "
+    with pytest.raises(InvalidSetting, match=re.escape(f"{expected}{url!r}")):
+        Blobs.open(url)
