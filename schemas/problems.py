@@ -25,6 +25,8 @@ class Explanation:
     cause: str
     remedy: str
     status: int | None = None
+    permanent: bool = False
+    """True if the same request fails again although its status is one of `RETRYABLE_STATUSES`."""
 
 
 class ProblemCode(StrEnum):
@@ -58,7 +60,7 @@ class ProblemCode(StrEnum):
     @property
     def retryable(self) -> bool:
         """True if the same request can succeed later."""
-        return self.status in RETRYABLE_STATUSES
+        return self.status in RETRYABLE_STATUSES and not explanations()[self].permanent
 
     # Requests
     BAD_REQUEST = auto()

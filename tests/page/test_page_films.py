@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import os
+import re
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -607,6 +608,18 @@ def test_a_running_film_job_shows_frame_points_progress_and_time_left(
     middle = "(it) => [...it.getContext('2d').getImageData(Math.round(it.width * 160.5 / 320), Math.round(it.height / 2), 1, 1).data]"
     until(lambda: live.evaluate(middle)[0] > live.evaluate(middle)[2] + 60)  # a mark on the white disc
     assert filming.title() == "30\u00a0% – a film – Pliant"
+
+
+def test_a_countdown_that_ends_before_the_job_shows_no_time(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
+    record = film_record(url, finished)
+    answer_with(filming, {**record, "progress": {**record["progress"], "seconds_left": 3.0}})
+    drop(filming, {"film.webm": films["film.webm"]})
+    filming.get_by_role("button", name="Reconstruct").click()
+    left = filming.locator(".figures div", has_text="Time left").locator("dd")
+    expect(left).to_have_text(re.compile(r"\d s"))
+    expect(left).to_have_text("–")
 
 
 NOTE = """() => {

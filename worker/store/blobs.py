@@ -126,7 +126,8 @@ class Blobs:
                 return cls(store, directory=Path(unquote(urlsplit(url).path)))
             options: Any = {**CLIENT, **client_options(os.environ)}
             try:
-                if urlsplit(url).scheme != "s3":
+                scheme, bucket, *_ = urlsplit(url)
+                if scheme != "s3" or not bucket:
                     raise ValueError(url)
                 return cls(from_url(url, client_options=options, retry_config=RETRIES), remote=True)
             except ValueError:

@@ -33,8 +33,9 @@ export class Countdown {
       this.onTick(job);
       return;
     }
-    const seconds = Math.max(0, left - (performance.now() - this.heard) / 1000);
-    this.onTick({ ...job, progress: { ...job.progress, seconds_left: seconds } });
-    this.timer = setTimeout(this.tick, EVERY);
+    const seconds = left - (performance.now() - this.heard) / 1000;
+    // The job is still running at the end of its countdown: the estimate was wrong, and there is no other one yet.
+    this.onTick({ ...job, progress: { ...job.progress, seconds_left: seconds > 0 ? seconds : null } });
+    if (seconds > 0) this.timer = setTimeout(this.tick, EVERY);
   };
 }

@@ -15,11 +15,11 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
 
 ROOT = Path(__file__).parents[3]
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 
 
 def executable() -> str | None:
-    """Return the path of a browser of the Chromium family."""
+    """Return the path of a browser of the Chromium family, preferably one without windows, which takes three quarters of the time."""
     given = os.environ.get("PLIANT_CHROMIUM")
     return given or next((found for name in NAMES if (found := shutil.which(name))), None)
 
