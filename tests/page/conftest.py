@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import httpx
 import pytest
 from browsing import Browsing
+from filming import KEEP_SENT, film_record, films_in, with_film_options
 from long_jobs import long_request
 from paging import QUICK, TRACKS, packed
 from playwright.sync_api import Browser, Page, ViewportSize
@@ -146,3 +147,20 @@ def finished(url: str, small: dict[str, bytes]) -> str:
         pass
     assert job["status"] == "succeeded", job["error"]
     return id
+
+
+@pytest.fixture(scope="session")
+def films(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """Films of six frames, the first of them red, the others blue; an mp4 in a codec that browsers do not decode."""
+    return films_in(tmp_path_factory.mktemp("films"))
+
+
+@pytest.fixture
+def filming(page: Page, url: str, finished: str) -> Page:
+    """The front page of a service that tracks films; its answers are prepared, and no job is created."""
+    page.route("**/v1/options", with_film_options)
+    page.route("**/v1/inspect", lambda route: route.fulfill(json=film_record(url, finished)["interpretation"]))
+    page.goto(url)
+    page.evaluate(KEEP_SENT)
+    page.get_by_text("Drop a film here").wait_for()
+    return page
