@@ -44,7 +44,7 @@ Mesh = Annotated[
 ]
 GroundTruth = Annotated[
     Path | None,
-    typer.Option("--ground-truth", "-g", help="True shapes; the result then has error metrics.", readable=False),
+    typer.Option("--ground-truth", "-g", help="True shapes, from which errors are measured.", readable=False),
 ]
 Rotations = Annotated[Path | None, typer.Option("--rotations", "-r", help="Known cameras.", readable=False)]
 

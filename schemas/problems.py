@@ -120,6 +120,8 @@ class ProblemCode(StrEnum):
     INVALID_WEBHOOK_SECRET = auto()
     WEBHOOK_NOT_PUBLIC = auto()
     ARTIFACT_GONE = auto()
+    UNKNOWN_SHARE = auto()
+    TOO_MANY_SHARES = auto()
 
     # Failed jobs
     TIMED_OUT = auto()
@@ -146,8 +148,6 @@ class ProblemCode(StrEnum):
     INCONSISTENT_UPLOAD_LENGTH = auto()
     INVALID_DIGEST = auto()
     DIGEST_MISMATCH = auto()
-    UNKNOWN_SHARE = auto()
-    TOO_MANY_SHARES = auto()
     TOO_MANY_UPLOADS = auto()
 
     # Input files
