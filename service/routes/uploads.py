@@ -132,7 +132,7 @@ async def patch(
     length: Length = None,
     digest: Digest = None,
 ) -> Upload:
-    """Append at `Upload-Offset`, as the IETF draft specifies. `PUT` with that header does the same, but at 0 it replaces what was uploaded."""
+    """Append at `Upload-Offset`, as the IETF draft specifies. `PUT` does the same, but at 0 it replaces what was uploaded."""
     if offset == 0:  # `PUT` would discard what is there, or begin an upload
         there = await to_thread.run_sync(uploads.get, id)
         if there.offset > 0 and not there.complete:
