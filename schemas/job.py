@@ -93,8 +93,7 @@ class Problem(Record):
         known = find_code(code)
         status = status or (known.status if known is not None else None) or 500
         title = HTTPStatus(status).phrase if known is None else known.heading
-        retryable = status in RETRYABLE_STATUSES if known is None or status != known.status else known.retryable
-        members.setdefault("retryable", retryable)
+        members.setdefault("retryable", status in RETRYABLE_STATUSES)
         return cls(title=title, status=status, code=code, detail=detail, **members)
 
 

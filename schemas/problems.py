@@ -25,8 +25,6 @@ class Explanation:
     cause: str
     remedy: str
     status: int | None = None
-    permanent: bool = False
-    """True if the same request fails again although its status is one of `RETRYABLE_STATUSES`."""
 
 
 class ProblemCode(StrEnum):
@@ -60,7 +58,7 @@ class ProblemCode(StrEnum):
     @property
     def retryable(self) -> bool:
         """True if the same request can succeed later."""
-        return self.status in RETRYABLE_STATUSES and not explanations()[self].permanent
+        return self.status in RETRYABLE_STATUSES
 
     # Requests
     BAD_REQUEST = auto()

@@ -57,8 +57,7 @@ def test_each_group_of_error_codes_has_its_introduction(generate: ModuleType) ->
     assert {
         title for title in generate.ERROR_GROUPS if f"## {title}\n\n{generate.ERROR_GROUPS[title]}" not in text
     } == set()
-    assert "### timed_out\n\n**Status 504**. " in text
-    assert "### worker_lost\n\n**Status 503**, retryable. " in text
+    assert "### timed_out\n\n**Status 504**, retryable. " in text
 
 
 def test_exactly_the_warnings_in_the_source_are_documented() -> None:

@@ -171,13 +171,6 @@ def test_problems_accept_codes_of_newer_versions() -> None:
     assert Problem(title="T", status=500, detail="D.", code="out_of_memory").type == "/errors/out_of_memory"
 
 
-@pytest.mark.parametrize("code", ["timed_out", "out_of_memory"])
-def test_a_job_that_exceeded_a_limit_is_not_retryable(code: str) -> None:
-    assert not Problem.of(code, detail="Too large. Send fewer points.").retryable
-    assert Problem.of("storage_full", detail="Full. Try again later.").retryable
-    assert Problem.of(code, 503, detail="With another status.").retryable
-
-
 def test_an_error_defaults_to_the_status_of_its_code() -> None:
     assert Refusal(ProblemCode.BODY_STALLED, detail="D.").status == 408
     assert Refusal(ProblemCode.UNKNOWN_UPLOAD, detail="D.", status=422).status == 422

@@ -27,7 +27,7 @@ pytestmark = [
     pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
 ]
 
-AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
+AXE = Path(__file__).parents[3] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 
 
 def test_a_region_drawn_with_the_mouse_is_sent_with_the_film(
