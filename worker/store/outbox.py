@@ -5,6 +5,7 @@ Webhooks are therefore delivered at least once, whichever process is killed; rec
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import redis
@@ -20,65 +21,81 @@ redis.call('HINCRBY', at .. 'tally', 'webhooks:tried', 1)
 return {due[1], redis.call('HINCRBY', at .. 'outbox:tries', due[1], 1)}
 """
 
-# ARGV: 1 prefix, 2 id, 3 when it is due
-_POSTPONE = """
-if redis.call('ZADD', ARGV[1] .. 'outbox', 'XX', 'CH', ARGV[3], ARGV[2]) == 0 then return 0 end
-redis.call('HINCRBY', ARGV[1] .. 'outbox:tries', ARGV[2], -1)
-redis.call('HINCRBY', ARGV[1] .. 'tally', 'webhooks:tried', -1)
+# A job that was deleted or retried since may have another message under the same id, whose entry is then no longer due at the
+# end of this lease. ARGV: 1 prefix, 2 id, 3 end of the lease
+_LEASED = """
+if tonumber(redis.call('ZSCORE', ARGV[1] .. 'outbox', ARGV[2]) or -1) ~= tonumber(ARGV[3]) then return 0 end
+"""
+
+# ARGV: 4 when it is due, 5 attempts to subtract
+_LATER = f"""{_LEASED}
+redis.call('ZADD', ARGV[1] .. 'outbox', ARGV[4], ARGV[2])
+redis.call('HINCRBY', ARGV[1] .. 'outbox:tries', ARGV[2], -ARGV[5])
+redis.call('HINCRBY', ARGV[1] .. 'tally', 'webhooks:tried', -ARGV[5])
 return 1
 """
 
-# ARGV: 1 prefix, 2 id, 3 name of the tally
-_CLOSE = """
-if redis.call('ZREM', ARGV[1] .. 'outbox', ARGV[2]) == 0 then return 0 end
+# ARGV: 4 name of the tally
+_CLOSE = f"""{_LEASED}
+redis.call('ZREM', ARGV[1] .. 'outbox', ARGV[2])
 redis.call('HDEL', ARGV[1] .. 'outbox:tries', ARGV[2])
-redis.call('HINCRBY', ARGV[1] .. 'tally', ARGV[3], 1)
+redis.call('HINCRBY', ARGV[1] .. 'tally', ARGV[4], 1)
 return 1
 """
+
+
+@dataclass(frozen=True, slots=True)
+class Lease:
+    """A message that is being sent."""
+
+    id: str
+    """The job."""
+
+    tries: int
+    """Number of leases, including this one."""
+
+    until: int
+    """When others may take the message, milliseconds since 1970."""
 
 
 class Outbox:
-    """The pending messages. All times in milliseconds since 1970; every method may raise `StoreUnavailable`."""
+    """The pending messages. All times in milliseconds since 1970; every method may raise `StoreUnavailable`.
+
+    A lease that is over, since its job was deleted or another process took the message, changes nothing.
+    """
 
     def __init__(self, client: redis.Redis, *, prefix: str) -> None:
-        self._redis: Any = client
         self._at = f"{prefix}:"
         self._take = client.register_script(_TAKE)
-        self._postpone = client.register_script(_POSTPONE)
+        self._later = client.register_script(_LATER)
         self._close = client.register_script(_CLOSE)
 
-    def take(self, *, now: int, until: int) -> tuple[str, int] | None:
-        """Lease the message that has been due longest, until the time `until`; return None if none is due.
-
-        Returns
-        -------
-        id : str
-            The job.
-        tries : int
-            Number of leases, including this one.
-        """
+    def take(self, *, now: int, until: int) -> Lease | None:
+        """Lease the message that has been due longest, until the time `until`; return None if none is due."""
         with reachable():
-            found = self._take(args=[self._at, now, until])
-        return None if found is None else (str(found[0]), int(found[1]))
+            found: Any = self._take(args=[self._at, now, until])
+        return None if found is None else Lease(str(found[0]), int(found[1]), until)
 
-    def delivered(self, id: str) -> None:
+    def delivered(self, lease: Lease) -> None:
         """Remove a delivered message."""
-        self._closed(id, "webhooks:delivered")
+        self._closed(lease, "webhooks:delivered")
 
-    def given_up(self, id: str) -> None:
+    def given_up(self, lease: Lease) -> None:
         """Remove a message that cannot be delivered."""
-        self._closed(id, "webhooks:given_up")
+        self._closed(lease, "webhooks:given_up")
 
-    def later(self, id: str, *, due: int) -> None:
-        """Schedule the next attempt at a message; nothing happens if its job was deleted."""
-        with reachable():
-            self._redis.zadd(f"{self._at}outbox", {id: due}, xx=True)
+    def later(self, lease: Lease, *, due: int) -> None:
+        """Schedule the next attempt at a message."""
+        self._scheduled(lease, due, subtracted=0)
 
-    def postpone(self, id: str, *, due: int) -> None:
+    def postpone(self, lease: Lease, *, due: int) -> None:
         """Return a leased message that was not sent; the lease does not count as an attempt."""
-        with reachable():
-            self._postpone(args=[self._at, id, due])
+        self._scheduled(lease, due, subtracted=1)
 
-    def _closed(self, id: str, tally: str) -> None:
+    def _scheduled(self, lease: Lease, due: int, *, subtracted: int) -> None:
         with reachable():
-            self._close(args=[self._at, id, tally])
+            self._later(args=[self._at, lease.id, lease.until, due, subtracted])
+
+    def _closed(self, lease: Lease, tally: str) -> None:
+        with reachable():
+            self._close(args=[self._at, lease.id, lease.until, tally])

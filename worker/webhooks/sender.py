@@ -23,7 +23,7 @@ from pliant.worker.errors import StoreUnavailable, UnknownJob
 from pliant.worker.records import Records, Webhook
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
-from pliant.worker.store.outbox import Outbox
+from pliant.worker.store.outbox import Lease, Outbox
 from pliant.worker.webhooks.address_policy import Address, NotPublic, checked_address, resolve
 from pliant.worker.webhooks.message import message, signed
 
@@ -118,8 +118,8 @@ class WebhookSender:
             if taken is None:
                 await asyncio.sleep(LOOK_EVERY)
                 continue
-            id, tries, limits = taken
-            task = asyncio.create_task(self._deliver(id, tries))
+            lease, limits = taken
+            task = asyncio.create_task(self._deliver(lease))
             under_way.add(task)
             busy.update(limits)
             task.add_done_callback(under_way.discard)
@@ -128,10 +128,10 @@ class WebhookSender:
         for task in under_way:
             task.cancel()
 
-    def _take(self, busy: Counter[str]) -> tuple[str, int, list[str]] | None:
+    def _take(self, busy: Counter[str]) -> tuple[Lease, list[str]] | None:
         """Lease a due message whose receiver and owner are below their limits; postpone the others.
 
-        Returns the job's id, the number of attempts including this one, and the keys of receiver and owner in `busy`.
+        Returns the lease, and the keys of receiver and owner in `busy`.
         """
         while True:
             now = self.clock()
@@ -139,38 +139,38 @@ class WebhookSender:
             if taken is None:
                 return None
             try:
-                stored = self.records.get(taken[0])
+                stored = self.records.get(taken.id)
             except UnknownJob:
-                self.outbox.given_up(taken[0])
+                self.outbox.given_up(taken)
                 continue
             host = "" if stored.webhook is None else urlsplit(stored.webhook.url).netloc
             receiver, owner = f"receiver {host}", f"owner {stored.owner}"
             if busy[receiver] < PER_RECEIVER and busy[owner] < PER_OWNER:
-                return *taken, [receiver, owner]
-            self.outbox.postpone(taken[0], due=int((now + POSTPONED) * 1000))
+                return taken, [receiver, owner]
+            self.outbox.postpone(taken, due=int((now + POSTPONED) * 1000))
 
-    async def _deliver(self, id: str, tries: int) -> None:
+    async def _deliver(self, lease: Lease) -> None:
         """Send the message once and record the outcome."""
         try:
             try:
-                stored = await asyncio.to_thread(self.records.get, id)
+                stored = await asyncio.to_thread(self.records.get, lease.id)
             except UnknownJob:
-                return await asyncio.to_thread(self.outbox.given_up, id)
-            if stored.webhook is None or tries > len(self.pauses) + 1:  # attempts of killed processes count, too
-                return await asyncio.to_thread(self._give_up, id, "the maximum number of attempts is reached.")
+                return await asyncio.to_thread(self.outbox.given_up, lease)
+            if stored.webhook is None or lease.tries > len(self.pauses) + 1:  # attempts of killed processes count, too
+                return await asyncio.to_thread(self._give_up, lease, "the maximum number of attempts is reached.")
             body = message(stored.job)
             try:
                 async with asyncio.timeout(WITHIN):
                     # The attempt's id, because a new job may have the id of a deleted one.
                     status = await self._post(stored.webhook, id=f"msg_{stored.attempt_id}", body=body)
             except NotPublic as error:
-                await asyncio.to_thread(self._give_up, id, str(error))
+                await asyncio.to_thread(self._give_up, lease, str(error))
             except _failures() as error:
-                await asyncio.to_thread(self._again, id, tries, type(error).__name__)
+                await asyncio.to_thread(self._again, lease, type(error).__name__)
             else:
-                await asyncio.to_thread(self._handle_status, id, tries, status)
+                await asyncio.to_thread(self._handle_status, lease, status)
         except StoreUnavailable as error:  # the message is sent again after the lease
-            logger.warning("webhook of job %s: %s", id, error)
+            logger.warning("webhook of job %s: %s", lease.id, error)
 
     async def _post(self, webhook: Webhook, *, id: str, body: bytes) -> int:
         """Send to the address that was checked; return the status of the response, whose body is not read."""
@@ -204,26 +204,26 @@ class WebhookSender:
 
     # Log before the outbox changes: a finished message has its log line even if the process is killed in between.
 
-    def _handle_status(self, id: str, tries: int, status: int) -> None:
+    def _handle_status(self, lease: Lease, status: int) -> None:
         if 200 <= status < 300:
-            self._log(id, f"Webhook delivered: the receiver returned {status} (attempt {tries}).")
-            self.outbox.delivered(id)
+            self._log(lease.id, f"Webhook delivered: the receiver returned {status} (attempt {lease.tries}).")
+            self.outbox.delivered(lease)
         elif status == 410:
-            self._give_up(id, "the receiver returned 410 Gone.")
+            self._give_up(lease, "the receiver returned 410 Gone.")
         else:
-            self._again(id, tries, f"the receiver returned {status}")
+            self._again(lease, f"the receiver returned {status}")
 
-    def _again(self, id: str, tries: int, why: str) -> None:
-        if tries > len(self.pauses):
-            self._give_up(id, f"{why} (attempt {tries}, the last one).")
+    def _again(self, lease: Lease, why: str) -> None:
+        if lease.tries > len(self.pauses):
+            self._give_up(lease, f"{why} (attempt {lease.tries}, the last one).")
             return
-        pause = self.pauses[tries - 1] * (1 + 0.2 * random.random())  # noqa: S311 - spreads the retries
-        self._log(id, f"Webhook not delivered: {why} (attempt {tries}); next attempt in {pause:.0f} s.")
-        self.outbox.later(id, due=int((self.clock() + pause) * 1000))
+        pause = self.pauses[lease.tries - 1] * (1 + 0.2 * random.random())  # noqa: S311 - spreads the retries
+        self._log(lease.id, f"Webhook not delivered: {why} (attempt {lease.tries}); next attempt in {pause:.0f} s.")
+        self.outbox.later(lease, due=int((self.clock() + pause) * 1000))
 
-    def _give_up(self, id: str, why: str) -> None:
-        self._log(id, f"Webhook abandoned: {why}")
-        self.outbox.given_up(id)
+    def _give_up(self, lease: Lease, why: str) -> None:
+        self._log(lease.id, f"Webhook abandoned: {why}")
+        self.outbox.given_up(lease)
 
     def _log(self, id: str, sentence: str) -> None:
         logger.info("job %s: %s", id, sentence)

@@ -29,7 +29,7 @@ from pliant.worker.jobs.submission import Submission
 from pliant.worker.records import Webhook
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
-from pliant.worker.store.outbox import Outbox
+from pliant.worker.store.outbox import Lease, Outbox
 from pliant.worker.webhooks.sender import (
     CONCURRENT,
     PAUSES,
@@ -126,7 +126,7 @@ def webhook_sender(door: Jobs) -> Iterator[WebhookSender]:
 
 def pending(outbox: Outbox) -> int:
     """The number of messages that are not sent yet."""
-    return int(outbox._redis.zcard(f"{outbox._at}outbox"))
+    return int(outbox._take.registered_client.zcard(f"{outbox._at}outbox"))
 
 
 def until(holds: Callable[[], object], *, seconds: float = 10.0) -> None:
@@ -375,7 +375,7 @@ def test_one_owner_does_not_occupy_all_connections(door: Jobs, made: Made, webho
     webhook_sender.clock = lambda: time.time() + 3
     taken = webhook_sender._take(collections.Counter())
     assert taken is not None
-    assert taken[:2] == (job.id, 1)
+    assert (taken[0].id, taken[0].tries) == (job.id, 1)
 
 
 def test_a_message_survives_a_sender_killed_while_sending_it(
@@ -383,7 +383,9 @@ def test_a_message_survives_a_sender_killed_while_sending_it(
 ) -> None:
     job = made(receiver.url)
     now = int(time.time() * 1000)
-    assert webhook_sender.outbox.take(now=now + 10, until=now + 1500) == (job.id, 1), "and then it was killed"
+    assert webhook_sender.outbox.take(now=now + 10, until=now + 1500) == Lease(job.id, 1, now + 1500), (
+        "and then it was killed"
+    )
     assert webhook_sender.outbox.take(now=now + 10, until=now + 1500) is None, "nobody else sends it meanwhile"
     webhook_sender.start()
     until(lambda: "(attempt 2)" in door.log(job.id))
@@ -404,10 +406,14 @@ def test_a_message_that_always_kills_its_sender_is_abandoned(
 def test_a_deleted_job_sends_nothing(door: Jobs, made: Made, receiver: Receiver, settings: Settings) -> None:
     job = made(receiver.url)
     outbox = Outbox(connect(settings.redis, decode=True), prefix=settings.queue)
+    lease = outbox.take(now=int(time.time() * 1000) + 10, until=int(time.time() * 1000) + 60_000)
+    assert lease is not None
     door.delete(job.id)
     assert pending(outbox) == 0
-    outbox.later(job.id, due=0)
+    outbox.later(lease, due=0)
+    outbox.postpone(lease, due=0)
     assert pending(outbox) == 0, "nor does a try that was under way bring it back"
+    assert door.records.tallies()["webhooks:tried"] == 1
 
 
 def test_a_retried_job_sends_its_webhook_and_a_job_without_one_does_not(
@@ -439,6 +445,23 @@ def test_a_new_job_with_the_id_of_a_deleted_one_sends_another_message(
         until(lambda: pending(webhook_sender.outbox) == 0)
         door.delete("take-1")
         assert len({headers["webhook-id"] for _, headers, _ in receiver.got}) == number
+
+
+def test_a_job_submitted_while_the_message_of_its_deleted_namesake_is_sent_keeps_its_message(
+    door: Jobs, receiver: Receiver, webhook_sender: WebhookSender, inputs_file: Path, interpretation: Interpretation
+) -> None:
+    hooked = Submission(options=Options(), id="take-1", webhook=Webhook(url=receiver.url, secret=SECRET))
+    door.submit(inputs_file, hooked, interpretation=interpretation)
+    door.cancel("take-1")
+    receiver.open.clear()
+    webhook_sender.start()
+    until(lambda: len(receiver.got) == 1)
+    door.delete("take-1")
+    door.submit(inputs_file, hooked, interpretation=interpretation)
+    door.cancel("take-1")
+    receiver.open.set()
+    until(lambda: len(receiver.got) == 2 and pending(webhook_sender.outbox) == 0)
+    assert len({headers["webhook-id"] for _, headers, _ in receiver.got}) == 2
 
 
 def test_retry_pauses_increase_and_sum_to_about_a_day() -> None:
