@@ -144,6 +144,32 @@ def test_rows_with_frame_numbers_may_come_in_any_order(numbered: bool, tmp_path:
     np.testing.assert_allclose(read.tracks.points[SURE[order] > 0.5], POINTS[order][SURE[order] > 0.5])
 
 
+@pytest.mark.parametrize("step", [1, 5])
+def test_a_frame_without_a_row_shows_no_point(step: int, tmp_path: Path) -> None:
+    head, *rows = one_row_a_frame(",", ".").strip().split("\n")
+    numbered = [f"{step * (frame + 7)},{row.partition(',')[2]}" for frame, row in enumerate(rows)]
+    del numbered[2]
+    (tmp_path / "tracks.csv").write_text("\n".join([head, *numbered]))
+    read = read_inputs(tracks=tmp_path / "tracks.csv", mesh="none", options=Options())
+    assert read.tracks.num_frames == F
+    there = np.setdiff1d(np.arange(F), [2])
+    assert (read.tracks.visible[2] == 0).all()
+    np.testing.assert_allclose(read.tracks.points[there][SURE[there] > 0.5], POINTS[there][SURE[there] > 0.5])
+
+
+def test_frame_numbers_that_are_no_numbers_of_frames_are_refused_or_only_order_the_rows(tmp_path: Path) -> None:
+    head, *rows = one_row_a_frame(",", ".").strip().split("\n")
+    far = [f"{10**6 * frame + (frame == 1)},{row.partition(',')[2]}" for frame, row in enumerate(rows)]
+    (tmp_path / "tracks.csv").write_text("\n".join([head, *far]))
+    with pytest.raises(InvalidInput) as caught:
+        read_inputs(tracks=tmp_path / "tracks.csv", mesh="none", options=Options())
+    assert caught.value.code == "too_large"
+    seconds = [f"{0.04 * frame**2:.2f},{row.partition(',')[2]}" for frame, row in enumerate(rows)]
+    (tmp_path / "tracks.csv").write_text("\n".join([head, *seconds[::-1]]))
+    read = read_inputs(tracks=tmp_path / "tracks.csv", mesh="none", options=Options())
+    np.testing.assert_allclose(read.tracks.points[SURE > 0.5], POINTS[SURE > 0.5])
+
+
 def test_mediapipe_landmarks_are_fractions_of_the_picture(tmp_path: Path) -> None:
     places = np.random.default_rng(0).uniform(0.2, 0.8, (1, 33, 4)) + np.arange(F)[:, None, None] * 0.01
     head = ",".join(f"{axis}{index}" for index in range(33) for axis in ("x", "y", "z", "v"))

@@ -13,6 +13,7 @@ from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.formats.reading.pose_tables import (
     CONFIDENCE,
     LONGEST_ROW,
+    MAX_GAPS,
     SEPARATORS,
     cells,
     columns_of,
@@ -96,7 +97,7 @@ def _observations(columns: list[str], rows: list[list[float]], *, field: str, li
     frames = (numbers[:, 0] - numbers[:, 0].min()).astype(np.int64)
     names, points = np.unique(numbers[:, 1].astype(np.int64), return_inverse=True)
     count = int(frames.max()) + 1
-    if count * len(names) * 16 > limits.max_bytes or count > 100 * len(table):
+    if count * len(names) * 16 > limits.max_bytes or count > MAX_GAPS * len(table):
         raise too_large(
             field,
             expected=f"at most {limits.max_bytes:,} bytes as a full table",

@@ -24,6 +24,9 @@ SEPARATORS = "\t;,"
 LONGEST_ROW = 1 << 20
 """Maximum characters of a row; a row has two numbers for each point."""
 
+MAX_GAPS = 100
+"""Maximum number of frames per row or observation of a table: more are no gaps, but numbers that count something else."""
+
 LANDMARKS = frozenset((21, 33, 468, 478, 543))
 """Numbers of points in MediaPipe's hand, pose, face (without and with irises) and holistic models."""
 
@@ -146,9 +149,9 @@ def read_rows(
 ) -> Arrays:
     """Read the rows below the header, each of `width` cells; `before` lines were read already.
 
-    If every row has the number of its frame, rows may be in any order; words in that column are ignored. Returns the tracks `(F, P, 2)`
-    under the writer's name, NaN where a cell is empty, `likelihood (F, P)` if there are confidences, 1 for points without, and
-    `point_names` if the points have names.
+    If every row has the number of its frame, rows may be in any order, and a frame without a row shows no point; words in that column are
+    ignored. Returns the tracks `(F, P, 2)` under the writer's name, NaN where a cell is empty, `likelihood (F, P)` if there are
+    confidences, 1 for points without, and `point_names` if the points have names.
 
     Raises
     ------
@@ -175,13 +178,23 @@ def read_rows(
         if len(rows) * len(wanted) * 8 > limits.max_bytes:
             raise too_large(field, expected=f"at most {limits.max_bytes:,} bytes as a table", got="more")
     points = len(columns.x)
-    table = np.array(rows, dtype=np.float64).reshape(len(rows), len(wanted))
-    if np.isfinite(frames).all():
-        table = table[_in_order(np.array(frames), field)]
+    places = np.arange(len(rows))
+    if rows and np.isfinite(frames).all():
+        places = _places(np.array(frames), field)
+    count = int(places.max(initial=-1)) + 1
+    if count * len(wanted) * 8 > limits.max_bytes or count > MAX_GAPS * len(rows):
+        raise too_large(
+            field,
+            expected=f"at most {limits.max_bytes:,} bytes as a full table",
+            got=f"{count:,} frames × {points:,} points",
+        )
+    table = np.full((count, len(wanted)), np.nan)
+    table[places] = np.array(rows, dtype=np.float64).reshape(len(rows), len(wanted))
     found: Arrays = {columns.writer: np.stack([table[:, :points], table[:, points : 2 * points]], axis=2)}
     if seen:
-        found["likelihood"] = np.ones((len(rows), points))
+        found["likelihood"] = np.ones((count, points))
         found["likelihood"][:, list(seen)] = table[:, 2 * points :]
+        found["likelihood"][np.setdiff1d(np.arange(count), places)] = 0.0
     return {**found, **found_names(columns.names)}
 
 
@@ -192,8 +205,8 @@ def _number_or_nan(cell: str, separator: str) -> float:
         return np.nan
 
 
-def _in_order(frames: NDArray[np.float64], field: str) -> NDArray[np.intp]:
-    """Return the rows in the order of their frames."""
+def _places(frames: NDArray[np.float64], field: str) -> NDArray[np.intp]:
+    """Return the index of each row's frame; if whole numbers have a common step, such as 0, 5, 10, the step counts as one frame."""
     order = np.argsort(frames)
     again = np.flatnonzero(np.diff(frames[order]) == 0)
     if len(again):
@@ -201,4 +214,10 @@ def _in_order(frames: NDArray[np.float64], field: str) -> NDArray[np.intp]:
             "duplicate_observation", field=field, expected="one row for each frame", got=f"frame {frames[order[again[0]]]:g} twice",
             hint="Keep one row for each frame, with the columns of all points.",
         )  # fmt: skip
-    return order
+    after = frames - frames.min()
+    if (frames == np.rint(frames)).all() and np.abs(frames).max() <= 2**53:
+        steps = after.astype(np.int64)
+        return np.asarray(steps // max(1, int(np.gcd.reduce(steps))), dtype=np.intp)
+    places = np.zeros(len(frames), dtype=np.intp)
+    places[order] = np.arange(len(frames))
+    return places
