@@ -47,9 +47,20 @@ def idempotency_key(request: Request, key: _KeyHeader = None) -> str | None:
 
 
 Key = Annotated[str | None, Depends(idempotency_key)]
-Prefer = Annotated[
-    str | None, Header(description="`wait=20` answers when the job has ended, or after 20 s, whichever comes first.")
-]
+
+
+def preferences(
+    request: Request,
+    prefer: Annotated[
+        str | None,
+        Header(description="`wait=20` answers when the job has ended, or after 20 s, whichever comes first."),
+    ] = None,
+) -> str | None:
+    """Return the request's preferences; they may be spread over several headers of the name."""
+    return None if prefer is None else ",".join(request.headers.getlist("Prefer"))
+
+
+Prefer = Annotated[str | None, Depends(preferences)]
 _WAIT = re.compile(r"\s*wait\s*=\s*(\d{1,6})\s*", re.IGNORECASE)
 _SUBMIT_ERRORS = problems(400, 401, 403, 404, 408, 409, 413, 415, 422, 429, 503, 507)
 _LOCATION = {"Location": {"description": "The job's address.", "schema": {"type": "string"}}}

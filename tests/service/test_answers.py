@@ -118,6 +118,8 @@ def test_waiting_ends_with_the_job_or_its_time_limit(running: Running, http: htt
     timer.start()
     begun = time.monotonic()
     assert http.get(f"/v1/jobs/{job.id}", headers={"Prefer": "respond-async, wait=15"}).json()["status"] == "succeeded"
+    several = [("Prefer", "return=representation"), ("Prefer", "wait=15")]
+    assert http.get(f"/v1/jobs/{job.id}", headers=several).headers["preference-applied"] == "wait=15"
     assert time.monotonic() - begun < 14
     timer.join()
 
