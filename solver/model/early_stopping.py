@@ -11,9 +11,8 @@ If the motion has few modes, the held-out likelihood improves to the end and EM 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from itertools import islice
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pliant.solver.model.expectation_maximisation import (
@@ -45,6 +44,20 @@ MAX_NLL_RISE = 1.0
 """Rise of the held-out negative log likelihood above its minimum, per point and frame, that ends the scoring."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Schedule:
+    """The rounds of EM from scratch that held-out points favour."""
+
+    model_order: ModelOrder
+
+    floors: Floats
+    """Floors of τ of the rounds, shape `(n,)`."""
+
+    def learned(self, gram: Floats, projections: Floats) -> ShapeCovariance:
+        """Return the covariance after these rounds; arguments as for `learn_with_early_stopping`."""
+        return _last(_rounds(gram, projections, self.model_order, self.floors))
+
+
 def learn_with_early_stopping(
     sample: Floats,
     gram: Floats,
@@ -71,9 +84,11 @@ def learn_with_early_stopping(
     should_stop : callable, optional
         Called between rounds; once it returns True, scoring ends.
     """
-    stopped = _stopped_early(sample, gram, projections, model_order, seed, should_stop)
-    if stopped is not None:
-        return stopped
+    early = schedule(sample, projections, model_order, seed=seed, should_stop=should_stop)
+    if early is not None:
+        covariance = early.learned(gram, projections)
+        reason = f"learned in {len(early.floors)} rounds; more would make held-out points less probable."
+        return covariance, described(covariance, reason)
     covariance = learned(
         gram,
         projections,
@@ -88,38 +103,30 @@ def learn_with_early_stopping(
     return covariance, described(covariance, reason if model_order.max_modes < MAX_MODES else "")
 
 
-def _stopped_early(
+def schedule(
     sample: Floats,
-    gram: Floats,
     projections: Floats,
     model_order: ModelOrder,
-    seed: int,
-    should_stop: Callable[[], bool] | None,
-) -> tuple[ShapeCovariance, str] | None:
-    """Return the covariance after the rounds that held-out points favour, and a sentence; None where they favour all rounds."""
+    *,
+    seed: int = 0,
+    should_stop: Callable[[], bool] | None = None,
+) -> Schedule | None:
+    """Return the rounds that held-out points favour; None where they favour all rounds. Arguments as for `learn_with_early_stopping`."""
     frames, count = sample.shape[:2]
     if not MIN_JUDGED_POINTS <= count < min(2 * frames, MAX_SAMPLE_POINTS):
         return None
     points = sample.transpose(0, 2, 1).reshape(2 * frames, count)
     ways = [
-        (each, floors)
+        Schedule(replace(model_order, max_modes=each), floors)
         for each in sorted({model_order.max_modes, MAX_MODES})
         for floors in (ANNEALED_FLOORS, CONSTANT_FLOORS)
     ]
-    paths = [
-        _judged(points, projections, replace(model_order, max_modes=max_modes), floors, seed, should_stop)
-        for max_modes, floors in ways
-    ]
+    paths = [_judged(points, projections, each, seed, should_stop) for each in ways]
     best = min(paths, key=min)
     if not min(best) < min(path[-1] for path in paths) - MIN_NLL_GAIN:
         return None
-    max_modes, floors = ways[paths.index(best)]
-    start = scratch(gram, projections, max_modes, noisy_start=model_order.noisy_start, ordered=model_order.ordered)
-    path = rounds(start, gram, projections, floors=floors, max_modes=max_modes)
-    number = best.index(min(best)) + 1
-    covariance = next(islice(path, number - 1, None))
-    reason = f"learned in {number} rounds; more would make held-out points less probable."
-    return covariance, described(covariance, reason)
+    way = ways[paths.index(best)]
+    return replace(way, floors=way.floors[: best.index(min(best)) + 1])
 
 
 def described(covariance: ShapeCovariance, more: str = "") -> str:
@@ -129,23 +136,14 @@ def described(covariance: ShapeCovariance, more: str = "") -> str:
 
 
 def _judged(
-    points: Floats,
-    projections: Floats,
-    model_order: ModelOrder,
-    floors: Floats,
-    seed: int,
-    should_stop: Callable[[], bool] | None,
+    points: Floats, projections: Floats, way: Schedule, seed: int, should_stop: Callable[[], bool] | None
 ) -> list[float]:
     """Return the mean held-out negative log likelihood after every round, until it has risen by `MAX_NLL_RISE`."""
     part = np.random.default_rng(seed).permutation(points.shape[1]) % FOLDS
     paths, others = [], []
     for fold in range(FOLDS):
         own = points[:, part != fold]
-        gram = own @ own.T / own.shape[1]
-        start = scratch(
-            gram, projections, model_order.max_modes, noisy_start=model_order.noisy_start, ordered=model_order.ordered
-        )
-        paths.append(rounds(start, gram, projections, floors=floors, max_modes=model_order.max_modes))
+        paths.append(_rounds(own @ own.T / own.shape[1], projections, way.model_order, way.floors))
         others.append(points[:, part == fold])
     found: list[float] = []
     for covariances in zip(*paths, strict=True):
@@ -154,3 +152,16 @@ def _judged(
         if found[-1] > min(found) + MAX_NLL_RISE or (should_stop is not None and should_stop()):
             break
     return found
+
+
+def _rounds(gram: Floats, projections: Floats, model_order: ModelOrder, floors: Floats) -> Iterator[ShapeCovariance]:
+    """Yield the covariance after every round from scratch."""
+    start = scratch(
+        gram, projections, model_order.max_modes, noisy_start=model_order.noisy_start, ordered=model_order.ordered
+    )
+    return rounds(start, gram, projections, floors=floors, max_modes=model_order.max_modes)
+
+
+def _last(covariances: Iterator[ShapeCovariance]) -> ShapeCovariance:
+    *_, last = covariances
+    return last

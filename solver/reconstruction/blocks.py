@@ -79,7 +79,7 @@ def shapes_in_blocks(
     edges = np.zeros((0, 2), dtype=np.int32) if mesh is None else mesh.edges
     pulse()
     bending = _bending(tracks, cameras, prior, mesh, groups, settings, monitor)
-    changes = _changes(cameras, prior, monitor)
+    changes = _changes(tracks, cameras, prior, settings, monitor)
     for number, own in enumerate(groups):
         kept = with_margin(own, edges, tracks.num_points)
         part, surface = _part(tracks, kept), None if mesh is None else mesh_of(mesh, kept)
@@ -149,12 +149,21 @@ def _bending(
     return tracks.num_points / total
 
 
-def _changes(cameras: Cameras, prior: Prior | None, monitor: Monitor) -> Changes | None:
+def _changes(
+    tracks: Tracks, cameras: Cameras, prior: Prior | None, settings: Settings, monitor: Monitor
+) -> Changes | None:
     """Return the jackknife result that all blocks share; None without a learned prior."""
     if prior is None:
         return None
-    turning = cameras.observations.turning
-    return learning_changes(estimate_with(cameras, prior), prior.normalized, turning=turning, should_stop=monitor)
+    estimate = estimate_with(cameras, prior)
+    sampled = cameras.observations.of(_part(tracks, estimate.sampled)).normalized
+    observed = sampled.visible > 0
+    if estimate.filling is not None:
+        observed &= ~estimate.filling.outliers(sampled.points, sampled.visible)
+    return learning_changes(
+        estimate, prior.normalized, observed,
+        turning=cameras.observations.turning, seed=settings.seed, should_stop=monitor,
+    )  # fmt: skip
 
 
 def blocks(tracks: Tracks, count: int) -> list[NDArray[np.intp]]:

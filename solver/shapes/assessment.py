@@ -57,7 +57,7 @@ def assessed(
     turning : bool
         Whether the cameras were estimated.
     seed : int
-        Seed of the random sample of visibility patterns.
+        Seed of the random choices: visibility patterns, and folds of early stopping.
     connected : bool
         Whether sparsely observed points were placed on a surface with their neighbours; otherwise only the prior places them.
     changes : Changes, optional
@@ -83,7 +83,10 @@ def assessed(
         if connected:
             std = bounded_by_neighbours(std, solution.shapes, confidence)
         if changes is None:
-            changes = learning_changes(estimate, covariance, turning=turning, should_stop=should_stop)
+            observed = confidence[:, estimate.sampled] > 0
+            changes = learning_changes(
+                estimate, covariance, observed, turning=turning, seed=seed, should_stop=should_stop
+            )
         tick()
         np.hypot(std, changes.std_of(solution.shapes, unit, centred=centred), out=std)
         std *= INFLATION

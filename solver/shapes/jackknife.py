@@ -2,7 +2,9 @@
 
 The posterior of `shapes.uncertainty` takes cameras and prior covariance as known. Both are estimated from the same tracks: with few points,
 many frames or ambiguous motion, other points would have led to other shapes. The jackknife measures this. It leaves out each of K compact
-parts of the object in turn, refines covariance and cameras from the other points, and recomputes the shapes of all points.
+parts of the object in turn, refines covariance and cameras from the observations of the other points, and recomputes the shapes of all
+points. Hidden entries are expected values under the covariance of the solve, as in `refinement.observed`. Where early stopping limits the
+covariance (`model.early_stopping`), it is learned from scratch in the same rounds, before and after the cameras are refined.
 With x₍ₖ₎ the shapes without part k, x the shapes refined from all points, and x̄ the mean of the x₍ₖ₎,
 
     variance = (K − 1)/K Σₖ (x₍ₖ₎ − x̄)²,    bias = (K − 1) (x̄ − x),
@@ -23,8 +25,11 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import centred, columns, depth_map
 from pliant.solver.evaluation.alignment import procrustes
+from pliant.solver.model.early_stopping import Schedule, schedule
 from pliant.solver.model.expectation_maximisation import improve
 from pliant.solver.model.marginal_likelihood import fit
+from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.model.observation_model import ImageDensity
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 from pliant.solver.refinement.learned import Learned, motion_of, moved_to, scene_at
@@ -85,8 +90,10 @@ class Changes:
 def learning_changes(
     estimate: CameraEstimate,
     covariance: ShapeCovariance,
+    observed: NDArray[np.bool_],
     *,
     turning: bool,
+    seed: int = 0,
     should_stop: Callable[[], bool] | None = None,
 ) -> Changes:
     """Return how far positions change with the points from which cameras and prior are learned.
@@ -97,8 +104,12 @@ def learning_changes(
         Contains a sample of the (corrected) tracks.
     covariance : ShapeCovariance
         Prior of all F frames, in the axes of the estimate.
+    observed : array of bool, shape (F, S)
+        Which entries of the sample are observations; the others, hidden or rejected, do not count.
     turning : bool
         Whether to refine the cameras too.
+    seed : int
+        Seed of the folds of early stopping.
     should_stop : callable, optional
         Called between refinements; once it returns True, the changes are 0.
     """
@@ -110,18 +121,20 @@ def learning_changes(
         replace(covariance, modes=covariance.modes[used]),
         np.inf,
     )
-    sample = centred(np.asarray(estimate.sample)[used])
-    if sample.shape[1] <= MIN_LEARNED_POINTS:
+    sample = _Sample(centred(np.asarray(estimate.sample)[used]), observed[used])
+    if sample.points.shape[1] <= MIN_LEARNED_POINTS:
         return nothing
-    part_of = parts(sample)
-    without = []
+    every, without = np.ones(sample.points.shape[1], dtype=bool), []
     try:
-        everything = _shapes_from(sample, np.ones(len(part_of), dtype=bool), start, turning)
+        points = _points_of(sample.expected(start, every)[0])
+        order = ModelOrder(ordered=covariance.ordered)
+        early = schedule(points, _projections(start), order, seed=seed, should_stop=should_stop)
+        part_of, everything = parts(points), _shapes_from(sample, every, start, early, turning)
         for part in np.unique(part_of):
             if should_stop is not None and should_stop():
                 return nothing
             if (part_of != part).sum() >= MIN_LEARNED_POINTS:
-                without.append(_onto(_shapes_from(sample, part_of != part, start, turning), everything))
+                without.append(_onto(_shapes_from(sample, part_of != part, start, early, turning), everything))
     except np.linalg.LinAlgError:  # depth is unbounded
         return replace(nothing, bounded=False)
     if len(without) < 2:
@@ -130,6 +143,28 @@ def learning_changes(
     squared /= np.square(np.asarray(estimate.scales))[:, None]
     world = np.einsum("fij,fpi->pj", start.rotations / start.scales[:, None, None], everything) / len(used)
     return Changes(np.sqrt(squared), world)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sample:
+    """Tracks of the sampled points in the frames used."""
+
+    points: Floats
+    """Centred, shape `(F', S, 2)`, normalized units."""
+
+    observed: NDArray[np.bool_]
+    """Shape `(F', S)`."""
+
+    def expected(self, found: Learned, kept: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+        """Return expected tracks `(2F', n)` of the n points kept, and the expectation of W Wᵀ / n, shape `(2F', 2F')`."""
+        points, observed = self.points[:, kept], self.observed[:, kept]
+        if observed.all():
+            rows = columns(points)
+            return rows, rows @ rows.T / rows.shape[1]
+        image = found.covariance.of_image(_projections(found))
+        density = ImageDensity.of(image, found.covariance.noise_variance)
+        means, covariance = density.moments(np.where(observed[..., None], points, 0.0), observed.astype(np.float64))
+        return means, (means @ means.T + covariance) / means.shape[1]
 
 
 def parts(sample: Floats) -> NDArray[np.intp]:
@@ -158,19 +193,38 @@ def _mean_squared_change(without: Floats, everything: Floats) -> Floats:
     return np.asarray(variance + np.square(bias).sum(axis=2))
 
 
-def _shapes_from(sample: Floats, kept: NDArray[np.bool_], start: Learned, turning: bool) -> Floats:
-    """Return posterior mean shapes `(F, S, 3)` in camera axes, with cameras and covariance refined from the points kept."""
-    rows = columns(sample[:, kept])
-    gram = rows @ rows.T / rows.shape[1]
-    projections = start.rotations[:, :2] * start.scales[:, None, None]
-    covariance = improve(start.covariance, gram, projections, iterations=LEARNING_ROUNDS)
-    found = replace(start, covariance=covariance)
+def _shapes_from(
+    sample: _Sample, kept: NDArray[np.bool_], start: Learned, early: Schedule | None, turning: bool
+) -> Floats:
+    """Return posterior mean shapes `(F', S, 3)` in camera axes, with cameras and covariance refined from the points kept."""
+    gram = sample.expected(start, kept)[1]
+
+    def relearned(found: Learned) -> Learned:
+        projections = _projections(found)
+        if early is None:
+            return replace(found, covariance=improve(found.covariance, gram, projections, iterations=LEARNING_ROUNDS))
+        return replace(found, covariance=early.learned(gram, projections))
+
+    found = relearned(start)
     if turning:
-        scene = scene_at(gram, start.rotations, with_scales=bool((start.scales != 1).any()), ordered=covariance.ordered)
+        with_scales = bool((start.scales != 1).any())
+        scene = scene_at(gram, start.rotations, with_scales=with_scales, ordered=found.covariance.ordered)
         moved = fit(scene, motion_of(scene, found), iterations=TURNING_ITERATIONS, turning=True)
         found = moved_to(scene, found, *moved)
-    depths = depth_map(found.rotations, found.scales, found.covariance) @ columns(sample)
-    return np.concatenate([sample, depths[..., None]], axis=2)
+        if early is not None:
+            found = relearned(found)
+    means, _ = sample.expected(found, np.ones(kept.shape, dtype=bool))
+    depths = depth_map(found.rotations, found.scales, found.covariance) @ means
+    return np.concatenate([_points_of(means), depths[..., None]], axis=2)
+
+
+def _projections(found: Learned) -> Floats:
+    return np.asarray(found.rotations[:, :2] * found.scales[:, None, None])
+
+
+def _points_of(rows: Floats) -> Floats:
+    """Return the points `(F, P, 2)` of rows `(2F, P)`."""
+    return rows.reshape(-1, 2, rows.shape[1]).transpose(0, 2, 1)
 
 
 def _onto(shapes: Floats, others: Floats) -> Floats:

@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.perspective import centred, columns
+from pliant.solver.cameras.perspective import centred, columns, depth_map
+from pliant.solver.model.early_stopping import learn_with_early_stopping
 from pliant.solver.model.expectation_maximisation import annealed
+from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 from pliant.solver.shapes.jackknife import MIN_LEARNED_POINTS, PARTS, learning_changes, parts
@@ -18,7 +20,9 @@ from scipy.spatial.transform import Rotation
 FRAMES = 12
 
 
-def seen(points: int, *, degrees: float = 50.0, seed: int = 0) -> tuple[CameraEstimate, ShapeCovariance, np.ndarray]:
+def seen(
+    points: int, *, degrees: float = 50.0, noise: float = 1e-3, seed: int = 0
+) -> tuple[CameraEstimate, ShapeCovariance, np.ndarray]:
     """A mean shape with two modes seen by a turning camera: estimate, learned covariance and true shapes."""
     rng = np.random.default_rng(seed)
     modes = np.stack([np.sin(np.arange(FRAMES) / 2), np.cos(np.arange(FRAMES) / 3)])
@@ -26,7 +30,7 @@ def seen(points: int, *, degrees: float = 50.0, seed: int = 0) -> tuple[CameraEs
     shapes = centred(shapes)
     turn = np.linspace(0, degrees, FRAMES)
     rotations = Rotation.from_euler("yx", np.stack([turn, 0.3 * turn], axis=1), degrees=True).as_matrix()
-    sample = np.einsum("fij,fpj->fpi", rotations[:, :2], shapes) + 1e-3 * rng.normal(size=(FRAMES, points, 2))
+    sample = np.einsum("fij,fpj->fpi", rotations[:, :2], shapes) + noise * rng.normal(size=(FRAMES, points, 2))
     rows = columns(centred(sample))
     gram = rows @ rows.T / points
     covariance = annealed(gram, rotations[:, :2], iterations=40)
@@ -40,9 +44,12 @@ def learning_std(
     shapes: np.ndarray,
     *,
     turning: bool,
+    observed: np.ndarray | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Floats:
-    return learning_changes(estimate, covariance, turning=turning, should_stop=should_stop).std_of(shapes, 1.0)
+    observed = np.ones(estimate.sample.shape[:2], dtype=bool) if observed is None else observed
+    found = learning_changes(estimate, covariance, observed, turning=turning, should_stop=should_stop)
+    return found.std_of(shapes, 1.0)
 
 
 def rms(values: np.ndarray) -> float:
@@ -75,6 +82,32 @@ def test_learning_std_does_not_depend_on_the_world_axes() -> None:
     )
 
 
+@pytest.mark.parametrize("turning", [False, True])
+@pytest.mark.parametrize("points", [20, 30])
+def test_hidden_entries_count_nothing(points: int, turning: bool) -> None:
+    estimate, covariance, shapes = seen(points)
+    observed = np.random.default_rng(1).uniform(size=(FRAMES, points)) > 0.2
+    values = np.random.default_rng(2).normal(size=estimate.sample.shape) * ~observed[..., None]
+    hidden = ~observed[..., None] / np.maximum((~observed).sum(axis=1), 1)[:, None, None]
+    values -= hidden * values.sum(axis=1, keepdims=True)  # keeps the centre of all entries
+    plain, other = (
+        learning_std(replace(estimate, sample=each), covariance, shapes, turning=turning, observed=observed)
+        for each in (estimate.sample, estimate.sample + values)
+    )
+    np.testing.assert_allclose(other, plain, rtol=1e-2 if turning else 1e-6)  # L-BFGS amplifies rounding
+
+
+def test_refits_of_few_noisy_points_stop_early() -> None:
+    """Otherwise they fit the noise, and the changes exceed the error twofold."""
+    estimate, _, shapes = seen(14, noise=0.05)
+    covariance, why = learn_with_early_stopping(estimate.sample, estimate.gram, estimate.rotations[:, :2], ModelOrder())
+    assert "held-out" in why
+    depths = depth_map(estimate.rotations, estimate.scales, covariance) @ columns(centred(estimate.sample))
+    truth = np.einsum("fj,fpj->fp", estimate.rotations[:, 2], shapes)
+    ratio = rms(learning_std(estimate, covariance, shapes, turning=True)) / rms(depths - truth)
+    assert 0.3 < ratio < 1.3
+
+
 def test_learning_std_is_interpolated_between_evaluated_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     estimate, covariance, shapes = seen(30)
     whole = learning_std(estimate, covariance, shapes, turning=False)
@@ -92,7 +125,7 @@ def test_too_few_points_or_a_stop_give_zero() -> None:
 
 
 def test_unbounded_depth_caps_the_std_at_the_distance_from_the_centroid() -> None:
-    estimate, covariance, shapes = seen(20)
+    estimate, covariance, shapes = seen(30)  # more points than coordinates: learning starts from this covariance
     unbounded = replace(covariance, mean_covariance=np.full((3, 3), 1e30))
     found = learning_std(estimate, unbounded, shapes, turning=False)
     np.testing.assert_allclose(found, np.linalg.norm(shapes - shapes.mean(axis=1, keepdims=True), axis=2))
