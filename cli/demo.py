@@ -234,8 +234,9 @@ def running(folder: Path) -> Iterator[str]:
             url = announced(process.stdout)
             if url is None:
                 process.wait(STOPS_WITHIN)
-                last = " / ".join(log.read_text(errors="replace").splitlines()[-6:])
-                raise Unreachable(f"The service did not start (code {process.returncode}): {last}")
+                raise Unreachable(
+                    f"The service did not start (code {process.returncode}): {why(log.read_text(errors='replace'))}"
+                )
             yield url
         finally:
             if process.poll() is None:
@@ -243,6 +244,14 @@ def running(folder: Path) -> Iterator[str]:
             process.wait(STOPS_WITHIN)
             if process.stdout is not None:
                 process.stdout.close()
+
+
+def why(log: str) -> str:
+    """Return the message of an error that `pliant up --json` printed, else its last lines."""
+    try:
+        return str(json.loads(log)["detail"])
+    except (ValueError, LookupError, TypeError):
+        return " / ".join(log.splitlines()[-6:])
 
 
 def announced(stream: IO[str]) -> str | None:

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 import redis
 from pliant.cli import app
-from pliant.cli.demo import GOOD, announced, judge
+from pliant.cli.demo import GOOD, announced, judge, why
 from pliant.cli.session import Session, name_of, parse_options
 from pliant.cli.solve import file_or_word
 from pliant.client import BadArgument, Unreachable
@@ -172,6 +172,14 @@ def test_the_demonstration_succeeds_only_if_all_errors_are_small() -> None:
 def test_the_address_is_read_from_the_output_of_up() -> None:
     assert announced(io.StringIO('{\n  "url": "http://x",\n  "data": "d"\n}\n')) == "http://x"
     assert announced(io.StringIO("")) is None
+
+
+def test_a_service_that_does_not_start_gives_its_message_or_its_last_lines() -> None:
+    assert why('{\n  "title": "Refused",\n  "detail": "PLIANT_PORT: expected a number."\n}\n') == (
+        "PLIANT_PORT: expected a number."
+    )
+    assert why("one\n" * 9 + "[1]\nlast") == "one / one / one / one / [1] / last"
+    assert why('["a list"]') == '["a list"]'
 
 
 def verdicts(findings: object) -> dict[str, str]:

@@ -71,6 +71,19 @@ def test_the_list_follows_a_running_job_that_is_not_shown(page: Page, url: str, 
     httpx.post(f"{url}/v1/jobs/{beside}/cancel", timeout=60)
 
 
+def test_a_job_that_is_deleted_elsewhere_is_called_deleted(page: Page, url: str) -> None:
+    with Client(url) as client:
+        job = client.submit(gallery.face(6, 40).tracks.points, name="a job to delete", options={"prior": "smooth"})
+        job.wait(timeout=120, load=False)
+        page.goto(f"{url}/#job={job.id}")
+        page.locator(".view canvas").wait_for(timeout=30_000)
+        job.delete()
+    expect(page.get_by_role("alert")).to_contain_text("This job was deleted.", timeout=20_000)
+    expect(page.get_by_role("link", name="a job to delete")).to_have_count(0)
+    expect(page.get_by_role("article").get_by_role("button", name="Delete")).to_have_count(0)
+    expect(page.locator(".view canvas")).to_be_visible()  # what was loaded stays
+
+
 def test_an_outage_and_its_end_are_reported(page: Page, url: str, finished: str) -> None:
     page.route("**/v1/**", lambda route: route.abort())
     page.goto(f"{url}/#job={finished}")

@@ -1,6 +1,6 @@
 // One job: its state, the interpretation of its inputs, and its result.
 
-import { Refusal, artifactPath, cancelJob, deleteJob, getReport, isShared, isSingle, listJobs, retryJob } from "./api";
+import { Refusal, artifactPath, cancelJob, deleteJob, getJob, getReport, isShared, isSingle, listJobs, retryJob } from "./api";
 import { Afterwards } from "./afterwards";
 import { Countdown } from "./countdown";
 import { Curves } from "./curves";
@@ -62,6 +62,8 @@ export class Detail {
   private readonly leaving = new AbortController();
   private job: Job | null = null;
   private finished = false;
+  /** Whether the job was deleted elsewhere. */
+  private gone = false;
 
   constructor(
     readonly id: string,
@@ -140,6 +142,20 @@ export class Detail {
   learn(job: Job): void {
     const news = newer(this.job, job);
     if (news) this.show(news);
+  }
+
+  /** Fetch the record again, because the list lacks this job: say so if it was deleted elsewhere. */
+  async check(): Promise<void> {
+    if (this.job === null || this.gone) return;
+    try {
+      this.learn(await getJob(this.id));
+    } catch (error) {
+      if (!(error instanceof Refusal && error.problem.status === 404) || this.leaving.signal.aborted) return;
+      this.gone = true;
+      this.tell(new Refusal({ ...error.problem, detail: "This job was deleted. What is still shown here cannot be opened again.", hint: null }));
+      this.actions.replaceChildren();
+      for (const part of [this.standing, this.afterwards.element, this.files.element]) part.hidden = true;
+    }
   }
 
   private show(job: Job): void {

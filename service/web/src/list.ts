@@ -111,6 +111,10 @@ export class JobList {
     });
   }
 
+  has(id: string): boolean {
+    return this.jobs.some((job) => job.id === id);
+  }
+
   remove(id: string): void {
     this.jobs = this.jobs.filter((job) => job.id !== id);
     this.show();

@@ -109,6 +109,7 @@ async function start(): Promise<void> {
     offer();
     const jobs = await list.refresh();
     for (const job of jobs) if (job.id === detail?.id) detail.learn(job);
+    if (detail && !list.has(detail.id)) void detail.check();
     clear();
   } catch (error) {
     report(error);
