@@ -32,16 +32,11 @@ READ = {"json"}
 SHOWN = {"text", "mermaid", "http"}
 """Languages that are run, parsed, or only shown."""
 
-SLOW = {
-    "docs/explanation/depth.md", "docs/explanation/trust.md", "docs/how-to/camera.md", "docs/how-to/film-to-tracks.md",
-    "docs/how-to/outliers.md", "docs/how-to/tokens.md", "docs/reference/artifacts.md", "docs/reference/cli.md", "docs/reference/rest.md",
-    "docs/reference/sdk.md", "docs/tutorials/blender.md", "docs/tutorials/compare.md", "docs/tutorials/priors.md",
-    "docs/tutorials/python.md",
+LONG = {
+    "docs/how-to/camera.md", "docs/how-to/photographs.md", "docs/reference/artifacts.md", "docs/reference/cli.md",
+    "docs/tutorials/blender.md",
 }  # fmt: skip
-"""Pages whose code solves several jobs, tracks a film or starts an embedded Valkey, left to `make test-slow`."""
-
-LONG = {"docs/how-to/camera.md", "docs/reference/cli.md", "docs/tutorials/blender.md"}
-"""Slow pages whose shell blocks take most of a minute, left to `make test-long`."""
+"""Pages whose shell blocks take most of a minute, left to `make test-long`."""
 
 ADDRESS = "http://127.0.0.1:8000"
 SIZE = re.compile(r"\bface\(\d+, \d+\)")
@@ -87,22 +82,20 @@ TESTS = set(re.findall(r"def (test_\w+)\(", "".join(path.read_text() for path in
 
 
 def pages(language: str) -> list[ParameterSet]:
-    """Return the documents with blocks to run in this language, slow ones marked."""
+    """Return the documents with blocks to run in this language, long ones marked."""
     named = {path: path.relative_to(ROOT).as_posix() for path in DOCUMENTS}
     ran = [
         path for path in DOCUMENTS if any(b.document == path and b.language == language and not b.note for b in BLOCKS)
     ]
 
-    def marks(name: str) -> list[pytest.MarkDecorator]:
-        if name not in SLOW:
-            return []
-        return [pytest.mark.slow, pytest.mark.long] if language == "bash" and name in LONG else [pytest.mark.slow]
-
-    return [pytest.param(path, id=named[path], marks=marks(named[path])) for path in ran]
+    return [
+        pytest.param(path, id=named[path], marks=pytest.mark.long if language == "bash" and named[path] in LONG else ())
+        for path in ran
+    ]
 
 
-def test_the_slow_pages_exist() -> None:
-    assert {path.relative_to(ROOT).as_posix() for path in DOCUMENTS} >= SLOW
+def test_the_long_pages_exist() -> None:
+    assert {path.relative_to(ROOT).as_posix() for path in DOCUMENTS} >= LONG
 
 
 @pytest.fixture(scope="session")

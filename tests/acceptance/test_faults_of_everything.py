@@ -26,9 +26,9 @@ WANTED = (
 
 AGAIN = {
     "valkey_down", "api_uploading", "api_receiving", "frozen", "stopped", "job_process_storing",
-    "cancel_loading", "cancel_cameras", "cancel_exporting",
+    "cancel_queued", "cancel_loading", "cancel_cameras", "cancel_exporting", "api_waiting",
 }  # fmt: skip
-"""Faults that are also covered by `tests/hosts`, by stopping a worker (`tests/worker`), or in another state."""
+"""Faults that are also covered by `tests/hosts`, `tests/client`, by stopping a worker (`tests/worker`), or in another state."""
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -187,6 +187,7 @@ def test_inspect_shows_how_a_file_is_interpreted(tmp_path: Path) -> None:
     assert f"12 frames × {sequence.tracks.num_points} points" in ran.stdout
 
 
+@pytest.mark.long
 def test_up_rejects_ports_and_folders_in_use_and_leaves_no_process(tmp_path: Path) -> None:
     with running(tmp_path / "one") as url:
         port = url.rpartition(":")[2]

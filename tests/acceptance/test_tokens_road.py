@@ -96,6 +96,7 @@ def test_a_service_that_requires_tokens_does_not_start_without_one(tmp_path: Pat
     assert "PLIANT_AUTH=off" in ran.stderr
 
 
+@pytest.mark.long
 def test_the_command_line_requires_a_valid_token(url: str, first: dict[str, Any], tracks: Path) -> None:
     sent = pliant("submit", tracks, *QUICKLY, "--id", "mine", "--url", url, token=first["token"])
     assert sent.returncode == 0, sent.stderr

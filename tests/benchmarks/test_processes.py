@@ -42,7 +42,14 @@ def short_path() -> Iterator[Path]:
         yield Path(folder)
 
 
-@pytest.mark.parametrize("module", [*STARTING, "installation.cost", "accuracy.changed_constant"])
+@pytest.mark.parametrize(
+    "module",
+    [
+        *(pytest.param(each, marks=pytest.mark.long) for each in STARTING),
+        "installation.cost",
+        "accuracy.changed_constant",
+    ],
+)
 def test_help_starts_nothing(module: str, tmp_path: Path) -> None:
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
     ran = subprocess.run(
@@ -53,7 +60,7 @@ def test_help_starts_nothing(module: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
 @pytest.mark.parametrize("module", STARTING)
 def test_an_interrupted_benchmark_ends_what_it_started(module: str, number: int, short_path: Path) -> None:
     environment = {**os.environ, "TMPDIR": str(short_path)}

@@ -133,6 +133,7 @@ def test_a_film_without_a_region_gets_its_warning_before_it_is_tracked(
     assert "No region" not in solve(film, "-o", tmp_path, "--region", film.with_name("mask.png")).stderr
 
 
+@pytest.mark.slow
 def test_a_folder_of_pictures_is_sent_as_a_zip_that_depends_only_on_them(tmp_path: Path) -> None:
     pictures = [films.png(each) for each in films.textured_pictures(4, (96, 72))]
     sent = []

@@ -446,6 +446,7 @@ def test_numerical_libraries_are_loaded_after_their_threads_are_limited(
     assert (ran.returncode, ran.stdout) == (Exit.REFUSED, "1\n"), ran.stderr
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_solving_leaves_no_output(tmp_path: Path) -> None:
     from pliant.solver.gallery import face
 

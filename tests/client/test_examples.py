@@ -130,6 +130,7 @@ def test_batch_resumes_where_it_stopped(run, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "right" / "report.json").read_text()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_many_at_once(run, tmp_path: Path) -> None:
     for name in ("a", "b"):

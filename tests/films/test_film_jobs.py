@@ -124,6 +124,7 @@ def test_a_portrait_film_is_upright(tmp_path: Path) -> None:
     assert (facts.width, facts.height, facts.frames) == (72, 96, 6)
 
 
+@pytest.mark.slow
 def test_options_that_do_not_fit_the_film_are_rejected(film: Path, region: Path, tmp_path: Path) -> None:
     Image.new("L", (10, 10), 255).save(tmp_path / "small.png")
     wrong = refusal(FilmSource(film, tmp_path / "small.png"))

@@ -111,7 +111,7 @@ def model(url: str, small: dict[str, bytes]) -> dict[str, Any]:
     return record
 
 
-@pytest.mark.parametrize("language", ["Python", "Shell", "curl"])
+@pytest.mark.parametrize("language", ["Python", pytest.param("Shell", marks=pytest.mark.long), "curl"])
 def test_the_code_shown_submits_the_same_job(
     page: Page, url: str, small: dict[str, bytes], model: dict[str, Any], tmp_path: Path, language: str
 ) -> None:

@@ -183,7 +183,9 @@ def test_changing_the_unit_only_rescales_the_result(given: Scene, factor: float)
     assert scaled.choices.noise / factor == pytest.approx(plain.choices.noise, rel=1e-9)
 
 
-@pytest.mark.parametrize("settings", [{"prior": "smooth"}, {"prior": "smooth", "temporal_order": 2}, {}], ids=str)
+@pytest.mark.parametrize(
+    "settings", [{"prior": "smooth"}, pytest.param({"prior": "smooth", "temporal_order": 2}, marks=LONG), {}], ids=str
+)
 @pytest.mark.parametrize("given", [pytest.param(SCENE, id="grid"), pytest.param(TRIANGLES, id="triangles", marks=LONG)])
 def test_reversing_the_film_reverses_the_shapes(given: Scene, settings: dict[str, object]) -> None:
     forwards, backwards = (each.solved(**settings, **TIGHT) for each in (given, reversed_in_time(given)))

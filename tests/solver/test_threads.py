@@ -66,6 +66,7 @@ def test_a_limit_that_is_not_whole_is_rejected() -> None:
         pass
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_the_number_of_threads(many_cores: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         normal_equations, "SMALLEST", 1, raising=False

@@ -153,6 +153,7 @@ def test_the_result_does_not_depend_on_threads(turning: tuple[Path, RenderedFilm
     assert cv2.getNumThreads() == before
 
 
+@pytest.mark.slow
 def test_a_region_is_transferred_to_another_template_frame(turning: tuple[Path, RenderedFilm]) -> None:
     path, film = turning
     steps: list[TrackingStep] = []

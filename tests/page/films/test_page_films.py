@@ -32,7 +32,7 @@ pytestmark = [
 ]
 
 
-@pytest.mark.parametrize("name", ["film.webm", "pictures.zip"])
+@pytest.mark.parametrize("name", ["film.webm", pytest.param("pictures.zip", marks=pytest.mark.long)])
 def test_a_dropped_film_shows_its_first_frame_and_hides_other_inputs(
     filming: Page, films: dict[str, bytes], name: str
 ) -> None:
@@ -137,7 +137,7 @@ def test_a_film_that_the_browser_cannot_show_is_sent_without_a_region(
     assert "region_polygon" not in sent_options(filming)
 
 
-@pytest.mark.parametrize("name", ["old.mp4", "film.webm"])
+@pytest.mark.parametrize("name", ["old.mp4", pytest.param("film.webm", marks=pytest.mark.long)])
 def test_the_services_first_frame_is_used_if_the_browser_cannot_decode(
     filming: Page, url: str, films: dict[str, bytes], finished: str, name: str
 ) -> None:

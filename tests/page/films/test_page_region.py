@@ -150,7 +150,14 @@ def inspected(page: Page, url: str, finished: str, **fields: Any) -> None:
     page.route("**/v1/inspect", lambda route: route.fulfill(json=seen))
 
 
-@pytest.mark.parametrize("name", ["film.webm", pytest.param("moving.zip", marks=pytest.mark.long), "moving.gif"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "film.webm",
+        pytest.param("moving.zip", marks=pytest.mark.long),
+        pytest.param("moving.gif", marks=pytest.mark.long),
+    ],
+)
 def test_a_region_is_drawn_on_another_frame(
     filming: Page, url: str, films: dict[str, bytes], finished: str, name: str
 ) -> None:
@@ -209,7 +216,7 @@ def mask(*, inside: int = 255) -> bytes:
     "order",
     [
         pytest.param("film first", marks=pytest.mark.long),
-        "mask first",
+        pytest.param("mask first", marks=pytest.mark.long),
         pytest.param("together", marks=pytest.mark.long),
         "chosen",
     ],

@@ -176,6 +176,7 @@ def test_the_corrected_energy_gradient_matches_finite_differences() -> None:
         assert gradient[place] == pytest.approx(slope, rel=1e-4, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_focal_length_sign_of_depth_and_shapes_are_found(close: Solution) -> None:
     assert close.choices.camera == "perspective"
     assert close.choices.depth_sign == "settled"

@@ -69,6 +69,7 @@ def test_a_weight_without_effect_gives_a_warning(face: gallery.Sequence) -> None
     assert not any("no effect" in warning for warning in plain.warnings)
 
 
+@pytest.mark.slow
 def test_the_gaussian_prior_is_always_solved_in_double_precision(face: gallery.Sequence, default: Solution) -> None:
     assert Settings().precision == "float64"
     single = solved(face, face.tracks, precision="float32")

@@ -161,6 +161,7 @@ def test_a_stopped_solve_does_not_assume_isometry() -> None:
     assert isometric_surface(sheet.tracks, focal=FOCAL, image_size=SIZE, should_stop=lambda: True).surface is None
 
 
+@pytest.mark.slow
 def test_a_rolled_sheet_is_recovered_with_the_focal_length_known_in_one_world_frame() -> None:
     sheet = rolled(**SMALL)
     solution = solve(sheet.tracks, settings=Settings(focal=FOCAL, image_size=SIZE, order="film"))

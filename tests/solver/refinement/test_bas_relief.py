@@ -181,6 +181,7 @@ def test_perspective_is_the_same_at_twice_the_depth_and_twice_the_focal_length(m
     assert (twice.sample - plain.sample).std() < 0.1 * bent
 
 
+@pytest.mark.slow
 def test_a_given_focal_length_determines_the_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(joint_refinement, "settled_depth", None)
     settings = Settings(focal=900.0, image_size=(1280.0, 720.0), basis_size=2)

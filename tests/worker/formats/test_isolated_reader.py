@@ -66,6 +66,7 @@ def test_errors_are_transferred_completely(all_apart: None, tmp_path: Path) -> N
     assert {"layout": "points_frames"} in [choice["options"] for choice in asked.value.choices]
 
 
+@pytest.mark.slow
 def test_exceeding_memory_or_time_is_an_input_error(all_apart: None, tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "t.npz", tracks=np.zeros((1000, 20_000, 2), dtype=np.float32))
     with pytest.raises(InvalidInput, match="within 419,430,400 bytes") as caught:
