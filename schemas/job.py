@@ -225,7 +225,8 @@ class Job(Record):
     )
     priority: Priority = Field(
         "normal",
-        description="`high`, `normal` or `low`: order among the waiting jobs of one owner; jobs of others are not passed.",
+        description="`high`, `normal` or `low`: order among the waiting jobs of one owner; "
+        "it does not put a job ahead of other owners' jobs.",
     )
     place_in_queue: int | None = Field(None, description="Number of queued jobs ahead; null if not queued.")
     options: Options = Field(description="All options, also those that were not given.")

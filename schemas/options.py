@@ -104,7 +104,7 @@ class Options(Chosen):
 
     method: Literal["pseudo_inverse", "temporal", "spatio_temporal", "robust"] = Field(
         "robust",
-        description="pseudo_inverse: rotations' pseudo-inverse times the tracks. temporal: closed form with smoothness in time. "
+        description="pseudo_inverse: the shapes of smallest norm that fit the tracks. temporal: closed form with smoothness in time. "
         "spatio_temporal: smoothness in time and space, least squares. robust: in time and space, with a loss that resists outliers.",
     )
     camera: Literal["auto", "perspective", "scaled_orthographic", "orthographic"] = Field(
@@ -221,7 +221,7 @@ class Options(Chosen):
     glb_motion: Literal["auto", "frames"] = Field(
         "auto",
         description="How shapes.glb stores the motion. auto: as few modes of motion as keep every point within a thousandth "
-        "of the bounding box's diagonal. frames: a morph target a frame, exact in single precision; up to 200 frames.",
+        "of the bounding box's diagonal. frames: one morph target per frame, exact in single precision, for up to 200 frames.",
     )
 
     layout: Literal["auto", "frames_points", "points_frames"] = Field(

@@ -154,7 +154,7 @@ def valkey_down(instance: Instance) -> Outcome:
 
 
 @fault(
-    "worker and job process frozen beyond the lease while the files are written, thawed when another has finished the job"
+    "worker and job process frozen beyond the lease while the files are written, resumed when another has finished the job"
 )
 def frozen(instance: Instance) -> Outcome:
     id = submitted(instance, frames=60, points=8000, options=LARGE)

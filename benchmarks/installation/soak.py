@@ -212,7 +212,7 @@ def run(soak: Soak, seconds: float, every: float) -> int:
         times = sorted(soak.seconds[fault]) or [0.0]
         print(f"| {fault} | {faults[fault]} | {counts or 'none'} | {times[len(times) // 2]:.1f} / {times[-1]:.1f} |")
     print("\nEnds: " + ", ".join(f"{count} {what}" for what, count in soak.ends.most_common()))
-    print("Lost, doubled or left over: " + ("nothing" if not soak.wrong else "\n  ".join(["", *soak.wrong])))
+    print("Lost, duplicated or left over: " + ("nothing" if not soak.wrong else "\n  ".join(["", *soak.wrong])))
     return 1 if soak.wrong else 0
 
 

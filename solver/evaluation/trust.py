@@ -52,13 +52,13 @@ class Verdict(StrEnum):
     """Whether a result can be used."""
 
     GOOD = "good"
-    """Nothing speaks against it."""
+    """None of the criteria for the other verdicts applies."""
 
     WITH_CARE = "with_care"
-    """The reasons say what may be wrong."""
+    """Parts may be wrong; `Trust.reasons` says which."""
 
     DO_NOT_USE = "do_not_use"
-    """The reasons say why depth or shape is probably wrong."""
+    """Depth or shape is probably wrong; `Trust.reasons` says why."""
 
 
 @dataclass(frozen=True, slots=True)

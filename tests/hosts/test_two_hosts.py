@@ -49,7 +49,7 @@ def sound(hosts: Hosts) -> Iterator[None]:
     counts = tuple(str(len(found)) for found in misfits.values())
     ROWS.extend((*each, *counts) for each in UNDER_WAY)
     UNDER_WAY.clear()
-    assert misfits == {"lost": [], "doubled": [], "left over": []}
+    assert misfits == {"lost": [], "duplicated": [], "left over": []}
 
 
 def row(fault: str, *, noticed: float | None = None, moved: float | None = None) -> None:
@@ -224,7 +224,7 @@ def test_an_attempt_frozen_past_its_lease_writes_nothing_when_resumed(hosts: Hos
     assert (job["status"], job["attempt"]) == ("succeeded", 2)
     assert hosts.get(id) == job
     assert hosts.blobs(id) == before
-    row("a worker is frozen past its lease, and thawed", noticed=times[0], moved=times[1])
+    row("a worker is frozen past its lease, and resumed", noticed=times[0], moved=times[1])
 
 
 @pytest.mark.long
@@ -278,7 +278,7 @@ def test_jobs_succeed_with_valkey_and_s3_at_a_fifth_of_their_speed(hosts: Hosts)
 
 def test_the_table_is_written(hosts: Hosts) -> None:
     assert len(ROWS) >= 5
-    lines = ["| fault | noticed after | moved after | lost | doubled | left over |", "|---|---|---|---|---|---|"]
+    lines = ["| fault | noticed after | moved after | lost | duplicated | left over |", "|---|---|---|---|---|---|"]
     lines += [f"| {' | '.join(cells)} |" for cells in ROWS]
     TABLE.parent.mkdir(exist_ok=True)
     TABLE.write_text("\n".join(lines) + "\n")

@@ -467,7 +467,7 @@ export interface components {
             outputs_of: string | null;
             /**
              * Priority
-             * @description `high`, `normal` or `low`: order among the waiting jobs of one owner; jobs of others are not passed.
+             * @description `high`, `normal` or `low`: order among the waiting jobs of one owner; it does not put a job ahead of other owners' jobs.
              * @default normal
              * @enum {string}
              */
@@ -551,7 +551,7 @@ export interface components {
         Options: {
             /**
              * Method
-             * @description pseudo_inverse: rotations' pseudo-inverse times the tracks. temporal: closed form with smoothness in time. spatio_temporal: smoothness in time and space, least squares. robust: in time and space, with a loss that resists outliers.
+             * @description pseudo_inverse: the shapes of smallest norm that fit the tracks. temporal: closed form with smoothness in time. spatio_temporal: smoothness in time and space, least squares. robust: in time and space, with a loss that resists outliers.
              * @default robust
              * @enum {string}
              */
@@ -741,7 +741,7 @@ export interface components {
             glb_quantized: boolean;
             /**
              * Glb Motion
-             * @description How shapes.glb stores the motion. auto: as few modes of motion as keep every point within a thousandth of the bounding box's diagonal. frames: a morph target a frame, exact in single precision; up to 200 frames.
+             * @description How shapes.glb stores the motion. auto: as few modes of motion as keep every point within a thousandth of the bounding box's diagonal. frames: one morph target per frame, exact in single precision, for up to 200 frames.
              * @default auto
              * @enum {string}
              */

@@ -224,7 +224,7 @@ class Hosts:
             found.append(fsck.stdout.strip() or fsck.stderr.strip())
         listed = {job["id"] for job in self.http.get("/v1/jobs", params={"limit": 200}).json()["jobs"]}
         acknowledged = set(self.acknowledged)
-        return {"lost": sorted(acknowledged - listed), "doubled": sorted(listed - acknowledged), "left over": found}
+        return {"lost": sorted(acknowledged - listed), "duplicated": sorted(listed - acknowledged), "left over": found}
 
     def at_work(self, host: str) -> list[str]:
         """Return the scratch directories on a host."""
