@@ -19,7 +19,7 @@ from pliant.solver.solution import Solution
 
 INFLATION = 1.4
 """Factor applied to the standard deviation from posterior and jackknife, for errors that both omit: model errors and other optima of the
-cameras. With it, intervals of ± 4.3 standard deviations contain 93 % of the positions of the calibration sequences of
+cameras. With it, intervals of ± 4.3 standard deviations contain 92 % of the positions of the calibration sequences of
 `benchmarks.trust`."""
 
 
