@@ -22,7 +22,7 @@ from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import pulse
 from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import monitored
-from pliant.solver.reconstruction.prior import Prior, estimate_with
+from pliant.solver.reconstruction.prior import Prior, changes_of, estimate_with
 from pliant.solver.reconstruction.shapes import shapes_from
 from pliant.solver.reconstruction.start import (
     Start,
@@ -35,7 +35,6 @@ from pliant.solver.reconstruction.start import (
 from pliant.solver.records import Choices, Floats, Ints, Step, Tracks, read_only
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.assessment import judged
-from pliant.solver.shapes.jackknife import Changes, learning_changes
 from pliant.solver.shapes.sparsely_observed import mesh_of
 from pliant.solver.solution import Outcome, Solution, Trace
 from pliant.solver.storage import allocated, let_go
@@ -79,7 +78,7 @@ def shapes_in_blocks(
     edges = np.zeros((0, 2), dtype=np.int32) if mesh is None else mesh.edges
     pulse()
     bending = _bending(tracks, cameras, prior, mesh, groups, settings, monitor)
-    changes = _changes(tracks, cameras, prior, settings, monitor)
+    changes = None if prior is None else changes_of(tracks, cameras, prior, seed=settings.seed, should_stop=monitor)
     for number, own in enumerate(groups):
         kept = with_margin(own, edges, tracks.num_points)
         part, surface = _part(tracks, kept), None if mesh is None else mesh_of(mesh, kept)
@@ -147,23 +146,6 @@ def _bending(
         monitor.report_block(Step("initialise", 0.0), START_SHARE * (number + 1) / len(groups))
         let_go(tracks.points, tracks.visible)
     return tracks.num_points / total
-
-
-def _changes(
-    tracks: Tracks, cameras: Cameras, prior: Prior | None, settings: Settings, monitor: Monitor
-) -> Changes | None:
-    """Return the jackknife result that all blocks share; None without a learned prior."""
-    if prior is None:
-        return None
-    estimate = estimate_with(cameras, prior)
-    sampled = cameras.observations.of(_part(tracks, estimate.sampled)).normalized
-    observed = sampled.visible > 0
-    if estimate.filling is not None:
-        observed &= ~estimate.filling.outliers(sampled.points, sampled.visible)
-    return learning_changes(
-        estimate, prior.normalized, observed,
-        turning=cameras.observations.turning, seed=settings.seed, should_stop=monitor,
-    )  # fmt: skip
 
 
 def blocks(tracks: Tracks, count: int) -> list[NDArray[np.intp]]:

@@ -16,6 +16,7 @@ from pliant.solver.reconstruction.observations import OnStep, ShouldStop, monito
 from pliant.solver.records import Floats, KnownCamera, Step, Tracks
 from pliant.solver.refinement.covariance_learning import learn_covariance
 from pliant.solver.refinement.depth_rounds import with_depth_map
+from pliant.solver.shapes.jackknife import Changes, learning_changes
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -151,3 +152,31 @@ def estimate_with(cameras: Cameras, prior: Prior) -> CameraEstimate:
         return replace(prior.estimate, reasons=reasons, warnings=cameras.warnings)  # with completed tracks
     estimate = replace(cameras.estimate, reasons=reasons)
     return with_depth_map(estimate, prior.normalized, rotations, scales)
+
+
+def changes_of(tracks: Tracks, cameras: Cameras, prior: Prior, *, seed: int, should_stop: ShouldStop | None) -> Changes:
+    """Return the jackknife result of the tracks that the cameras were estimated from.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        These tracks, if the cameras came `without_points`; otherwise not used.
+    cameras, prior
+        The cameras, and the prior learned with them.
+    seed : int
+        Seed of the folds of early stopping.
+    should_stop : callable, optional
+        Called between refinements.
+    """
+    estimate, own = estimate_with(cameras, prior), cameras.observations.normalized
+    chosen = estimate.sampled
+    if own.points.shape[1] == 0:
+        some = Tracks.from_arrays(tracks.points[:, chosen], tracks.visible[:, chosen])
+        own, chosen = cameras.observations.of(some).normalized, np.arange(len(chosen))
+    points, visible = own.points[:, chosen], own.visible[:, chosen]
+    observed = visible > 0
+    if estimate.filling is not None:
+        observed &= ~estimate.filling.outliers(points, visible)
+    return learning_changes(
+        estimate, prior.normalized, observed, turning=cameras.observations.turning, seed=seed, should_stop=should_stop
+    )

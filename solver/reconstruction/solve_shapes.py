@@ -11,7 +11,7 @@ from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.blocks import needs_blocks, shapes_in_blocks
 from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import OnStep, ShouldStop, check_fit, monitored
-from pliant.solver.reconstruction.prior import Prior
+from pliant.solver.reconstruction.prior import Prior, changes_of
 from pliant.solver.reconstruction.shapes import shapes_from
 from pliant.solver.reconstruction.start import (
     check_shapes,
@@ -92,6 +92,9 @@ def solve_shapes(
         begun = with_outlier_reason(with_outliers_rejected(begun, monitor))
         if first is not None:
             begun = warm(begun, first)
+        changes = None  # computed with the final confidence, where the tracks are those of the cameras
+        if prior is not None and tracks is not cameras.observations.tracks:
+            changes = changes_of(tracks, cameras, prior, seed=settings.seed, should_stop=monitor)
         seconds, starts = {"initialise": time.perf_counter() - began}, [begun]
         del begun, first  # so that `shapes_from` has the only reference and can release the first state
-        return shapes_from(starts.pop(), monitor, seconds=seconds)
+        return shapes_from(starts.pop(), monitor, seconds=seconds, changes=changes)
