@@ -55,7 +55,7 @@ class Verdict(StrEnum):
     """None of the criteria for the other verdicts applies."""
 
     WITH_CARE = "with_care"
-    """Parts may be wrong; `Trust.reasons` says which."""
+    """Parts may be wrong; `Trust.reasons` says why."""
 
     DO_NOT_USE = "do_not_use"
     """Depth or shape is probably wrong; `Trust.reasons` says why."""

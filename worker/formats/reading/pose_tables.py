@@ -25,7 +25,7 @@ LONGEST_ROW = 1 << 20
 """Maximum characters of a row; a row has two numbers for each point."""
 
 MAX_GAPS = 100
-"""Maximum number of frames per row or observation of a table: more are no gaps, but numbers that count something else."""
+"""Maximum number of frames per row or observation of a table. With more, the numbers probably count something other than frames."""
 
 LANDMARKS = frozenset((21, 33, 468, 478, 543))
 """Numbers of points in MediaPipe's hand, pose, face (without and with irises) and holistic models."""
