@@ -161,8 +161,10 @@ def changes_of(tracks: Tracks, cameras: Cameras, prior: Prior, *, seed: int, sho
     ----------
     tracks : Tracks
         These tracks, if the cameras came `without_points`; otherwise not used.
-    cameras, prior
-        The cameras, and the prior learned with them.
+    cameras : Cameras
+        Estimated from these tracks.
+    prior : Prior
+        Learned with the cameras.
     seed : int
         Seed of the folds of early stopping.
     should_stop : callable, optional
