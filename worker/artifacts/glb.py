@@ -15,7 +15,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 from pliant.worker.artifacts.animation import Animation
-from pliant.worker.artifacts.geometry import Ints, Singles, vertex_normals
+from pliant.worker.artifacts.geometry import Floats, Ints, Singles, vertex_normals
 from pliant.worker.artifacts.names import DEFAULT
 from pliant.worker.artifacts.normals import fit_normals
 from pliant.worker.artifacts.view import View
@@ -104,13 +104,13 @@ class Buffer:
 
 
 def write_glb(
-    file: IO[bytes], animation: Animation, triangles: Ints, *, fps: float, node: dict[str, Any], name: str = DEFAULT,
+    file: IO[bytes], animation: Animation, triangles: Ints, *, times: Floats, node: dict[str, Any], name: str = DEFAULT,
     normals: str = "static", quantized: bool = False, colours: NDArray[np.uint16] | None = None, texture: Texture | None = None,
     view: View | None = None, on_progress: Callable[[float], None] | None = None,
 ) -> None:  # fmt: skip
     """Write the animation, y up and right-handed, from the file's current position.
 
-    Frame f is at f / fps seconds, with linear interpolation in between. Without triangles `(T, 3)` a point cloud is written. `node` holds
+    Frame f is at `times[f]` seconds, interpolated linearly. Without triangles `(T, 3)` a point cloud is written. `node` holds
     the properties of the node besides the mesh, e.g. `scale`. `normals` are `static` (those of the base shape), `animated` (displaced with
     the targets) or `none`. `quantized` writes 16-bit positions and 8-bit normals by KHR_mesh_quantization. `colours (P, 4)` are RGBA,
     linear light, 65535 for 1. The camera of `view` follows the mesh. `on_progress` gets the share of arrays written.
@@ -138,7 +138,7 @@ def write_glb(
         "nodes": [{"name": name, "mesh": 0, **placed}],
         "meshes": [mesh],
         "materials": [_material(coloured=colours is not None, textured=texture is not None)],
-        "animations": [_motion(buffer, animation, fps)],
+        "animations": [_motion(buffer, animation, times)],
         "bufferViews": buffer.views,
         "accessors": buffer.accessors,
     }
@@ -173,11 +173,10 @@ def _attributes(
     return attributes
 
 
-def _motion(buffer: Buffer, animation: Animation, fps: float) -> dict[str, Any]:
+def _motion(buffer: Buffer, animation: Animation, times: Floats) -> dict[str, Any]:
     """Add the times and the weights of the targets; return the glTF animation that plays them."""
-    times = (np.arange(len(animation.weights)) / fps).astype(np.float32)
     sampler = {
-        "input": buffer.add(times, bounds=True),
+        "input": buffer.add(times.astype(np.float32), bounds=True),
         "output": buffer.add(animation.weights.reshape(-1)),
         "interpolation": "LINEAR",
     }

@@ -114,7 +114,7 @@ def _glb(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
     view = view_of(result.solution.camera, shapes, y_axis=result.y_axis, scale=scale, image_size=result.image_size)
     on_progress(0.4)
     write_glb(
-        file, animation, triangles_of(result.faces), fps=options.fps, node={"scale": [scale] * 3}, name=object_name(result.name),
+        file, animation, triangles_of(result.faces), times=result.times, node={"scale": [scale] * 3}, name=object_name(result.name),
         normals=options.normals, quantized=options.glb_quantized, colours=colours,
         texture=result.texture, view=view, on_progress=lambda part: on_progress(0.4 + 0.6 * part),
     )  # fmt: skip

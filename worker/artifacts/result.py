@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import isclose
 
 import numpy as np
 from pliant.schemas.options import Options
@@ -12,6 +13,7 @@ from pliant.solver.evaluation.metrics import point_errors
 from pliant.worker.artifacts.colours import Painting
 from pliant.worker.artifacts.geometry import Floats, Ints, size_of, upright
 from pliant.worker.formats import Inputs, Texture
+from pliant.worker.formats.tracks.frame_times import mean_rate, uneven
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +38,29 @@ class Result:
             return None
         width, height = self.options.image_size.split("x")
         return float(width), float(height)
+
+    @cached_property
+    def uneven_times(self) -> Floats | None:
+        """Seconds of every frame of a film from the first, `(F,)`; None if its frames follow each other at the option `fps`.
+
+        That is also the case if the job sets another rate than the film's.
+        """
+        own = self.inputs.frame_times
+        if own is None or not isclose(self.options.fps, mean_rate(own)) or not uneven(own):
+            return None
+        return np.asarray(own - own[0])
+
+    @property
+    def time_codes(self) -> Floats:
+        """Time of every frame from the first, in units of 1 / `fps` seconds, `(F,)`."""
+        if self.uneven_times is None:
+            return np.arange(len(self.solution.shapes), dtype=np.float64)
+        return self.uneven_times * self.options.fps
+
+    @property
+    def times(self) -> Floats:
+        """Time of every frame from the first, seconds, `(F,)`."""
+        return self.time_codes / self.options.fps
 
     @cached_property
     def faces(self) -> Ints:

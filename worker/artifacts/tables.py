@@ -22,7 +22,7 @@ def write_frames_csv(result: Result, file: IO[bytes]) -> None:
     residuals, seen = result.solution.residuals, result.inputs.tracks.visible
     columns: dict[str, Column] = {
         "frame": np.arange(len(residuals)),
-        "seconds": np.arange(len(residuals)) / result.options.fps,
+        "seconds": result.times,
         "visible": (seen > 0).sum(axis=1),
         **_residuals(residuals, seen),
         "weight_mean": _mean(result.solution.weights, seen > 0),

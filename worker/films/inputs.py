@@ -14,9 +14,11 @@ from pliant.worker.formats.reading.arrays import read_file
 from pliant.worker.formats.records import Inputs, Limits, Selection
 from pliant.worker.formats.texture import Texture
 from pliant.worker.formats.tracks.decimation import thin
+from pliant.worker.formats.tracks.frame_times import ARRAY as TIMES
+from pliant.worker.formats.tracks.frame_times import read_frame_times
 from pliant.worker.formats.tracks.selection import hide_sparsely_observed
 
-REQUIRED = frozenset(("tracks", "visibility", "confidence", "grid"))
+REQUIRED = frozenset(("tracks", "visibility", "confidence", "grid", TIMES))
 TEXTURE_ARRAYS = frozenset(("template_image", "uv"))
 
 
@@ -32,7 +34,7 @@ def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
     """
     arrays = read_file(file, field="film", limits=Limits(), wanted=REQUIRED | TEXTURE_ARRAYS)
     if not set(arrays) >= REQUIRED or arrays["tracks"].shape[:2] != arrays["confidence"].shape:
-        raise damaged("film", "tracks without confidence or grid")
+        raise damaged("film", "tracks without confidence, grid or times")
     points = arrays["tracks"].astype(np.float64)
     visible = np.where(arrays["visibility"].astype(bool), arrays["confidence"], 0).astype(np.float64)
     given = points.shape[1]
@@ -55,4 +57,7 @@ def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
     texture = None
     if set(arrays) >= TEXTURE_ARRAYS:
         texture = Texture.from_tracked(arrays["template_image"], np.clip(arrays["uv"], 0, 1)).at_points(kept)
-    return Inputs(checked, mesh, None, None, stated, selection if selection.narrows else None, texture=texture)
+    times = read_frame_times(arrays, checked.num_frames, field="film")
+    return Inputs(
+        checked, mesh, None, None, stated, selection if selection.narrows else None, texture=texture, frame_times=times
+    )

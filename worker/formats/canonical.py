@@ -15,6 +15,8 @@ from pliant.worker.formats.point_names import pack, unpack
 from pliant.worker.formats.reading.arrays import read_file
 from pliant.worker.formats.records import Arrays, GroundTruth, Inputs, Limits, Selection
 from pliant.worker.formats.texture import Texture
+from pliant.worker.formats.tracks.frame_times import ARRAY as TIMES
+from pliant.worker.formats.tracks.frame_times import read_frame_times
 
 VERSION = 1
 OWN_FILES = Limits(max_bytes=1 << 36)
@@ -50,6 +52,8 @@ def save_inputs(inputs: Inputs, path: Path) -> None:
         arrays["uv"] = inputs.texture.uv
     if inputs.point_names is not None:
         arrays[NAMES] = pack(inputs.point_names)
+    if inputs.frame_times is not None:
+        arrays[TIMES] = inputs.frame_times
     with path.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
 
@@ -87,7 +91,7 @@ def load_inputs(path: Path) -> Inputs:
     interpretation = Interpretation.model_validate(json.loads(arrays["interpretation"].tobytes()))
     return Inputs(
         Tracks(points, _wide(arrays["visible"])), mesh, truth, cameras, interpretation, selection, _texture(arrays),
-        unpack(arrays.get(NAMES), points.shape[1]),
+        unpack(arrays.get(NAMES), points.shape[1]), read_frame_times(arrays, len(points), field="inputs"),
     )  # fmt: skip
 
 

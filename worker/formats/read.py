@@ -81,13 +81,23 @@ def read_inputs(
     names = understood.point_names
     if names is not None:
         names = tuple(names[point] for point in chosen.selection.points.tolist())
-    return Inputs(checked, chosen.mesh, truth, cameras, interpretation, selection, texture=texture, point_names=names)
+    times = None if film is None or film.times is None else film.times[chosen.selection.frames]
+    return Inputs(
+        checked,
+        chosen.mesh,
+        truth,
+        cameras,
+        interpretation,
+        selection,
+        texture=texture,
+        point_names=names,
+        frame_times=times,
+    )
 
 
 def _stated(film: FilmTracks, selection: Selection) -> dict[str, Any]:
     """Return the picture size, and the frame rate of the selected frames, for the interpretation."""
-    step = float(np.median(np.diff(selection.frames)))
-    return {"image_size": f"{film.image_size[0]}x{film.image_size[1]}", "fps": film.fps / step}
+    return {"image_size": f"{film.image_size[0]}x{film.image_size[1]}", "fps": film.rate(selection.frames)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -161,3 +161,6 @@ class Inputs:
 
     point_names: tuple[str, ...] | None = None
     """Names of the P points, where the file has them."""
+
+    frame_times: NDArray[np.float64] | None = None
+    """Seconds of every frame of a film, shape `(F,)`, increasing; None for other tracks."""

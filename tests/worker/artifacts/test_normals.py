@@ -66,7 +66,15 @@ def test_a_normal_that_flips_keeps_unit_length() -> None:
 def written(path: Path, *, quantized: bool) -> tuple[np.ndarray, pygltflib.GLTF2]:
     shapes, triangles = rippled()
     with path.open("wb") as file:
-        write_glb(file, animate(shapes), triangles, fps=10, node={}, normals="animated", quantized=quantized)
+        write_glb(
+            file,
+            animate(shapes),
+            triangles,
+            times=np.arange(len(shapes)) / 10,
+            node={},
+            normals="animated",
+            quantized=quantized,
+        )
     return shapes, pygltflib.GLTF2.load_binary(path)
 
 
@@ -77,7 +85,7 @@ def test_no_position_is_further_off_than_the_stated_error(tmp_path: Path, motion
     shapes, triangles = rippled()
     animation = animate(shapes, motion=motion)
     with (tmp_path / "x.glb").open("wb") as file:
-        write_glb(file, animation, triangles, fps=10, node={}, quantized=quantized)
+        write_glb(file, animation, triangles, times=np.arange(len(shapes)) / 10, node={}, quantized=quantized)
     gltf = pygltflib.GLTF2.load_binary(tmp_path / "x.glb")
 
     def positions(accessor: int) -> np.ndarray:

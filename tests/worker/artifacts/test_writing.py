@@ -207,7 +207,7 @@ def test_every_glb_variant_is_valid_and_plays_back(tmp_path: Path, quantized: bo
             file,
             animate(shapes, motion="frames"),
             triangles,
-            fps=30,
+            times=np.arange(9) / 30,
             node={},
             normals=normals,
             quantized=quantized,

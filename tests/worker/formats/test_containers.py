@@ -97,7 +97,7 @@ def test_glb_and_mask_meshes_keep_the_order_of_vertices(tmp_path: Path) -> None:
     np.savez(tmp_path / "t.npz", tracks=POINTS)
     faces = np.array([[0, 1, 6], [0, 6, 5], [13, 14, 19]], dtype=np.int32)
     with (tmp_path / "m.glb").open("wb") as out:
-        write_glb(out, animate(moving_sheet(F, ROWS, COLUMNS)), faces, fps=25, node={})
+        write_glb(out, animate(moving_sheet(F, ROWS, COLUMNS)), faces, times=np.arange(F) / 25, node={})
     got = read_inputs(tracks=tmp_path / "t.npz", mesh=tmp_path / "m.glb", options=Options())
     assert got.mesh is not None
     np.testing.assert_array_equal(got.mesh.faces, faces)

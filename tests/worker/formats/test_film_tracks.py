@@ -64,6 +64,8 @@ def test_every_array_of_the_tracker_is_used(tmp_path: Path) -> None:
     back = load_inputs(tmp_path / "stored.npz")
     assert back.interpretation == interpretation
     assert back.texture == inputs.texture or back.texture.jpeg == inputs.texture.jpeg  # type: ignore[union-attr]
+    for held in (inputs, back):
+        np.testing.assert_array_equal(held.frame_times, given["frame_times"])
 
 
 def test_options_and_a_given_mesh_override_the_file(tmp_path: Path) -> None:
@@ -95,6 +97,23 @@ def test_a_film_job_reads_the_file_as_a_tracks_job_does(tmp_path: Path) -> None:
     np.testing.assert_array_equal(alone.mesh.faces, job.mesh.faces)
     np.testing.assert_array_equal(alone.texture.uv, job.texture.uv)  # type: ignore[union-attr]
     assert alone.texture.jpeg == job.texture.jpeg  # type: ignore[union-attr]
+    np.testing.assert_array_equal(alone.frame_times, job.frame_times)
+
+
+def test_selected_frames_keep_their_times_and_have_their_own_mean_rate(tmp_path: Path) -> None:
+    file = film_file(tmp_path / "tracks.npz", frame_times=np.array([1.0, 1.1, 1.2, 1.3, 2.0]))
+    inputs = read_inputs(tracks=file, options=Options(frames="::2"))
+    np.testing.assert_array_equal(inputs.frame_times, [1.0, 1.2, 2.0])
+    assert inputs.interpretation.fps == 2.0
+    without = film_file(tmp_path / "without.npz", frame_times=None)
+    inputs = read_inputs(tracks=without, options=Options(frames="::2"))
+    assert (inputs.frame_times, inputs.interpretation.fps) == (None, 12.0)
+
+
+def test_a_film_process_that_leaves_out_the_times_is_not_believed(tmp_path: Path) -> None:
+    file = film_file(tmp_path / "tracks.npz", frame_times=None)
+    with pytest.raises(InvalidInput, match="without confidence, grid or times"):
+        read_tracked(file, Tracked(container="mp4", fps=30.0, warnings=()), Options())
 
 
 @pytest.mark.parametrize(
@@ -111,6 +130,11 @@ def test_a_film_job_reads_the_file_as_a_tracks_job_does(tmp_path: Path) -> None:
         ({"image_size": np.array([6.5, 4.0])}, "image_size"),
         ({"fps": np.array(0.0)}, "fps"),
         ({"fps": np.array([24.0, 25.0])}, "fps"),
+        ({"frame_times": np.arange(FRAMES - 1.0)}, "frame_times of shape"),
+        ({"frame_times": np.ones(FRAMES, dtype=bool)}, "frame_times that do not increase"),
+        ({"frame_times": np.array([0.0, 1.0, 1.0, 2.0, 3.0])}, "frame_times that do not increase"),
+        ({"frame_times": np.array([0.0, 1.0, np.nan, 2.0, 3.0])}, "frame_times that do not increase"),
+        ({"frame_times": np.array([0.0, 1.0, 2.0, 3.0, 1e300])}, "frame_times that do not increase"),
         ({"uv": np.zeros((3, 2), np.float32)}, "texture coordinates"),
         ({"template_image": np.zeros((4, 4), np.uint8)}, "template_image"),
         ({"template_image": np.zeros((1, 65_501, 3), np.uint8)}, "template_image"),  # too wide for a JPEG

@@ -31,12 +31,12 @@ def write_alembic(result: Result, file: IO[bytes], on_progress: Callable[[float]
 
 
 def _build(path: Path, result: Result, on_progress: Callable[[float], None]) -> None:
-    from alembic3d import Abc, AbcCoreAbstract, AbcGeom
+    from alembic3d import Abc, AbcGeom
 
     # The archive is written to disk when the last of its objects is released, at the end of this function.
     archive = Abc.OArchive(str(path), True)  # True: the Ogawa format, which all current readers support
     # Referred to by index, because the binding does not keep a TimeSampling alive.
-    sampling = archive.addTimeSampling(AbcCoreAbstract.TimeSampling(1 / result.options.fps, 0.0))
+    sampling = archive.addTimeSampling(_sampling(result))
     stand = AbcGeom.OXform(archive.getTop(), identifier(result.name))
     scale, placed = AbcGeom.XformOp(AbcGeom.XformOperationType.kScaleOperation, 0), AbcGeom.XformSample()
     placed.addOp(scale, _vector(viewer_scale(result.solution.shapes)))
@@ -46,6 +46,18 @@ def _build(path: Path, result: Result, on_progress: Callable[[float], None]) -> 
     for frame in range(frames):
         write(_points(result.standing(frame)))
         on_progress((frame + 1) / frames)
+
+
+def _sampling(result: Result) -> Any:
+    """Return the times of the samples: evenly spaced, or one by one for a film of variable frame rate."""
+    from alembic3d import AbcCoreAbstract
+
+    if result.uneven_times is None:
+        return AbcCoreAbstract.TimeSampling(1 / result.options.fps, 0.0)
+    times = AbcCoreAbstract.TimeVector()
+    times.extend(result.uneven_times.tolist())
+    acyclic = AbcCoreAbstract.TimeSamplingType(AbcCoreAbstract.AcyclicFlag.kAcyclic)
+    return AbcCoreAbstract.TimeSampling(acyclic, times)
 
 
 def _mesh_writer(parent: Any, sampling: int, result: Result) -> Callable[[Any], None]:

@@ -10,7 +10,6 @@ import struct
 from collections.abc import Callable
 from typing import IO
 
-import numpy as np
 from pliant.worker.artifacts.result import Result
 
 
@@ -18,7 +17,7 @@ def write_mdd(result: Result, file: IO[bytes], on_progress: Callable[[float], No
     """Write every frame; y up, right-handed, unscaled; point p is vertex p of the mesh in the other files."""
     frames, points, _ = result.solution.shapes.shape
     file.write(struct.pack(">ii", frames, points))
-    file.write((np.arange(frames) / result.options.fps).astype(">f4").tobytes())
+    file.write(result.times.astype(">f4").tobytes())
     for frame in range(frames):
         file.write(result.standing(frame).astype(">f4").tobytes())
         on_progress((frame + 1) / frames)

@@ -68,17 +68,17 @@ def _build(path: Path, result: Result, on_progress: Callable[[float], None]) -> 
     painted, kind = result.painting, Sdf.ValueTypeNames.Color3fArray
     painting = UsdGeom.PrimvarsAPI(shape)
     frames = len(result.solution.shapes)
-    for frame in range(frames):
+    for frame, code in enumerate(result.time_codes.tolist()):
         standing = result.standing(frame)
-        points.Set(Vt.Vec3fArray.FromNumpy(standing.astype(np.float32)), frame)
+        points.Set(Vt.Vec3fArray.FromNumpy(standing.astype(np.float32)), code)
         corners = np.stack([standing.min(axis=0), standing.max(axis=0)]).astype(np.float32)
-        extent.Set(Vt.Vec3fArray.FromNumpy(corners), frame)
+        extent.Set(Vt.Vec3fArray.FromNumpy(corners), code)
         if moving:
             normals = vertex_normals(standing, triangles_of(result.faces))
-            shape.CreateNormalsAttr().Set(Vt.Vec3fArray.FromNumpy(normals), frame)
+            shape.CreateNormalsAttr().Set(Vt.Vec3fArray.FromNumpy(normals), code)
         if painted is not None:
             colours = painting.CreatePrimvar("displayColor", kind, UsdGeom.Tokens.vertex)
-            colours.Set(Vt.Vec3fArray.FromNumpy(linear(painted.frame(frame)).astype(np.float32)), frame)
+            colours.Set(Vt.Vec3fArray.FromNumpy(linear(painted.frame(frame)).astype(np.float32)), code)
         on_progress((frame + 1) / frames)
     stage.GetRootLayer().Save()
 
@@ -92,7 +92,7 @@ def _describe_stage(stage: Any, result: Result) -> None:
     stage.SetTimeCodesPerSecond(result.options.fps)
     stage.SetFramesPerSecond(result.options.fps)
     stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(len(result.solution.shapes) - 1)
+    stage.SetEndTimeCode(float(result.time_codes[-1]))
 
 
 def _define(stage: Any, result: Result) -> Any:

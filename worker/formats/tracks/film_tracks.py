@@ -15,9 +15,14 @@ from pliant.worker.formats.errors import damaged
 from pliant.worker.formats.reading.containers import read_arrays
 from pliant.worker.formats.records import Arrays, Limits
 from pliant.worker.formats.texture import Texture
+from pliant.worker.formats.tracks.frame_times import ARRAY as TIMES
+from pliant.worker.formats.tracks.frame_times import mean_rate, read_frame_times
 
 REQUIRED = ("visibility", "confidence", "grid", "image_size", "fps")
 TEXTURE_ARRAYS = ("template_image", "uv")
+MAX_RATE = 1000.0
+"""Largest frame rate of the option `fps`."""
+
 MAX_PICTURE_SIDE = 10**5
 """Largest width or height of a picture, pixels."""
 
@@ -34,10 +39,19 @@ class FilmTracks:
     """Width and height of the film in pixels."""
 
     fps: float
-    """Frames per second."""
+    """Frames per second, if the times are unknown."""
+
+    times: NDArray[np.float64] | None
+    """Seconds of every frame, shape `(F,)`; None if they were removed from the file."""
 
     texture: Texture | None
     """The template frame with texture coordinates; None if they were removed from the file."""
+
+    def rate(self, frames: NDArray[np.intp]) -> float:
+        """Return the frames per second of some of the frames, by their increasing indices."""
+        if self.times is None:
+            return self.fps / float(np.median(np.diff(frames)))
+        return min(mean_rate(self.times[frames]), MAX_RATE)
 
 
 def read_film_tracks(path: Path, *, shape: tuple[int, int], limits: Limits) -> FilmTracks:
@@ -48,7 +62,7 @@ def read_film_tracks(path: Path, *, shape: tuple[int, int], limits: Limits) -> F
     InvalidInput
         Code damaged_file if an array is missing or does not fit the tracks, and the codes of `read_arrays` and `Mesh`.
     """
-    arrays = read_arrays(path, field="tracks", limits=limits, wanted=frozenset((*REQUIRED, *TEXTURE_ARRAYS)))
+    arrays = read_arrays(path, field="tracks", limits=limits, wanted=frozenset((*REQUIRED, TIMES, *TEXTURE_ARRAYS)))
     missing = [name for name in REQUIRED if name not in arrays]
     if missing:
         raise damaged("tracks", f"tracks of a film without {', '.join(missing)}")
@@ -65,7 +79,8 @@ def read_film_tracks(path: Path, *, shape: tuple[int, int], limits: Limits) -> F
     texture = None
     if all(name in arrays for name in TEXTURE_ARRAYS):
         texture = _texture(arrays, shape[1])
-    return FilmTracks(np.where(arrays["visibility"].astype(bool), confidence, 0.0), mesh, size, fps, texture)
+    visible = np.where(arrays["visibility"].astype(bool), confidence, 0.0)
+    return FilmTracks(visible, mesh, size, fps, read_frame_times(arrays, shape[0], field="tracks"), texture)
 
 
 def tracks_options(options: Options, interpretation: Interpretation) -> Options:
@@ -83,8 +98,8 @@ def _shot(arrays: Arrays) -> tuple[tuple[int, int], float]:
     if size.shape != (2,) or size.dtype.kind not in "iu" or not ((size > 0) & (size <= MAX_PICTURE_SIDE)).all():  # type: ignore[operator]
         raise damaged("tracks", "an image_size that is not two positive integers, width and height")
     fps = float(rate) if rate.shape == () and rate.dtype.kind in "fiu" else np.nan
-    if not 0 < fps <= 1000:
-        raise damaged("tracks", "an fps that is not a number from 0 to 1000")
+    if not 0 < fps <= MAX_RATE:
+        raise damaged("tracks", f"an fps that is not a number from 0 to {MAX_RATE:g}")
     return (int(size[0]), int(size[1])), fps
 
 
