@@ -5,14 +5,14 @@ from __future__ import annotations
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pliant.cli.session import LINE_EVERY
-from pliant.cli.show import out, show_warnings
+from pliant.cli.show import err, out, show_warnings
 
 if TYPE_CHECKING:
     from pliant.schemas.options import Options
@@ -126,7 +126,7 @@ def solve_film(
 ) -> Finished:  # fmt: skip
     """Track and reconstruct a film; also write `tracks.npz` and `contact_sheet.jpg`.
 
-    Warnings that are known beforehand are printed first and left out of the returned ones, so that none is printed twice.
+    Warnings about the film are printed as soon as they are known and left out of the returned ones, so that none is printed twice.
 
     Raises
     ------
@@ -145,17 +145,25 @@ def solve_film(
     source = FilmSource(film, region, own_rate="fps" in checked.model_fields_set)
     facts = check_film(source, checked)
     checked = film_options(checked, facts)
-    printed = [] if as_json else warnings_of_check(facts, region, checked)
+    printed: list[str] = []
+
+    def on_warnings(warnings: Sequence[str]) -> None:
+        if not as_json:
+            new = [each for each in warnings if each not in printed]
+            show_warnings(new, screen)
+            printed.extend(new)
+
+    screen = err()
     if not as_json:
         out().print(described(facts, checked).notes[0])
-        show_warnings(printed)
+    on_warnings(warnings_of_check(facts, region, checked))
     with (
         tempfile.TemporaryDirectory(prefix="pliant-film-") as scratch,
-        progress_bar(line_every=LINE_EVERY) as bar,
+        progress_bar(screen, line_every=LINE_EVERY) as bar,
         threads_limited(threads),
     ):
         done = reconstruct_film(
             source, checked, output, scratch=Path(scratch), name=name, threads=threads or usable_cores(),
-            on_progress=bar.on_step,
+            on_progress=bar.on_step, on_warnings=on_warnings,
         )  # fmt: skip
     return replace(done, warnings=tuple(each for each in done.warnings if each not in printed))

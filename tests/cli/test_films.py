@@ -53,6 +53,18 @@ def test_a_film_is_solved_and_its_tracks_are_written_beside_the_shapes(film: Pat
     assert words.index("No region was given") < words.index("metric")
 
 
+def test_warnings_of_a_film_are_printed_once_before_its_points_are_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, other = (films.textured_pictures(10, (96, 72), seed=seed) for seed in (0, 7))
+    film = films.write_film(tmp_path / "film.mkv", one + other)
+    monkeypatch.setattr("pliant.cli.films.LINE_EVERY", 0.02)
+    words = solve(film, "-o", tmp_path / "out", *QUICK).output
+    cut = "The film has a cut (at frame 10). Only frames 0 to 9 are tracked."
+    assert words.count(cut) == words.count("No region was given") == 1
+    assert words.index(cut) < words.index("cameras")
+
+
 def test_invalid_films_and_parts_are_rejected_with_a_message(film: Path, tmp_path: Path) -> None:
     ran = solve(film, "--mesh", "3x4", "-o", tmp_path)
     assert ran.exit_code == Exit.REFUSED

@@ -41,6 +41,7 @@ from pliant.worker.films.tracker import (
     FilmFacts,
     Tracked,
     believed_size,
+    believed_warnings,
     check_film,
     described,
     film_options,
@@ -358,7 +359,7 @@ def test_stopping_kills_the_film_process(film: Path, tmp_path: Path) -> None:
 def tracks_file(path: Path, **more: np.ndarray) -> Path:
     points = np.random.default_rng(0).uniform(0, 50, (4, 9, 2)).astype(np.float32)
     arrays = {"tracks": points, "visibility": np.ones((4, 9), bool), "confidence": np.full((4, 9), 0.5, np.float32),
-              "grid": np.arange(9, dtype=np.int32).reshape(3, 3)}  # fmt: skip
+              "grid": np.arange(9, dtype=np.int32).reshape(3, 3), "frame_times": np.arange(4.0)}  # fmt: skip
     np.savez(path, **(arrays | more))
     return path
 
@@ -376,7 +377,7 @@ def test_tracker_confidence_becomes_the_observation_weight(tmp_path: Path) -> No
     fewer = read_tracked(tmp_path / "a.npz", tracked, Options(stride=2))
     assert fewer.selection is not None
     assert fewer.tracks.num_points == 4
-    with pytest.raises(InvalidInput, match="without confidence or grid"):
+    with pytest.raises(InvalidInput, match="without confidence, grid or times"):
         read_tracked(tracks_file(tmp_path / "b.npz", confidence=np.ones((3, 9))), tracked, Options())
 
 
@@ -422,6 +423,12 @@ def test_progress_is_passed_on_and_invalid_lines_dropped() -> None:
 def test_implausible_stated_sizes_are_ignored(stated: object) -> None:
     assert believed_size(stated) is None
     assert believed_size([30, 900]) == (30, 900)
+
+
+@pytest.mark.parametrize("stated", [None, "warning", [1], ["x" * 1001], ["x"] * 101, {"warnings": []}])
+def test_implausible_warnings_are_ignored(stated: object) -> None:
+    assert believed_warnings(stated) == ()
+    assert believed_warnings(["Film in one take."]) == ("Film in one take.",)
 
 
 def test_the_time_estimate_includes_the_isometric_surface_search() -> None:

@@ -22,7 +22,7 @@ from pliant.worker.films import frame_strip
 from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.sources import FilmSource
-from pliant.worker.films.tracker import track_film
+from pliant.worker.films.tracker import OnWarnings, track_film
 from pliant.worker.jobs.finished import Finished
 
 FILES = {
@@ -46,11 +46,13 @@ def reconstruct_film(
     threads: int = 1,
     bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
     on_progress: Callable[[Progress], None] | None = None,
+    on_warnings: OnWarnings | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Finished:
     """Track the film, solve, evaluate and write the files. Raises the same errors as `pipeline.reconstruct`.
 
     The first stage is `track`. `scratch` is an empty folder for the film process; `threads` is the thread count of optical flow.
+    `on_warnings` is that of `track_film`.
     """
     kinds_for(options)
     reporter = Reporter(on_progress if on_progress is not None else silent, shares=FILM_SHARES)
@@ -67,7 +69,7 @@ def reconstruct_film(
         try:
             tracked = track_film(
                 source, options, scratch, bounds=bounds, threads=threads,
-                on_progress=told, should_stop=halt.requested,
+                on_progress=told, on_warnings=on_warnings, should_stop=halt.requested,
             )  # fmt: skip
         except Interrupted:
             halt.check()

@@ -152,6 +152,7 @@ def _track(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
         longest_side=options["longest_side"],
         threads=request["threads"],
         on_step=_reporter(request["progress"], film.size),
+        on_warnings=lambda warnings: _tell(request["progress"], {"warnings": warnings}),
     )
     tracked.save_npz(folder / "tracks.npz")
     (folder / "contact_sheet.jpg").write_bytes(tracked.contact_sheet())
@@ -192,9 +193,14 @@ def _reporter(target: int, size: tuple[int, int]) -> Callable[[TrackingStep], No
         low, high = SHARES[step.stage]
         done = low if not step.total else low + (high - low) * min(1.0, step.done / step.total)
         line = {"done": done, "observations": _observations(step), "followed": _followed(step, size)}
-        os.write(target, json.dumps(line).encode() + b"\n")
+        _tell(target, line)
 
     return report
+
+
+def _tell(target: int, line: dict[str, Any]) -> None:
+    """Write a line to a descriptor."""
+    os.write(target, json.dumps(line).encode() + b"\n")
 
 
 def _observations(step: TrackingStep) -> list[int] | None:

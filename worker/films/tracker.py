@@ -17,7 +17,7 @@ from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.sources import FilmSource
 from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.processes.contained import DONE, REFUSED, Ended, refusal_in, run_contained
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 MODULE = "pliant.worker.films.contained_process"
 TRACKING_OPTIONS = {"frames", "template_frame", "grid_step", "longest_side", "region_frame", "region_polygon"}
@@ -25,6 +25,10 @@ TRACKING_OPTIONS = {"frames", "template_frame", "grid_step", "longest_side", "re
 
 Count = Annotated[int, Field(ge=0, lt=2**40)]
 Words = Annotated[str, Field(max_length=1000)]
+
+
+Warnings = Annotated[tuple[Words, ...], Field(max_length=100)]
+WARNINGS: TypeAdapter[tuple[str, ...]] = TypeAdapter(Warnings)
 
 
 class FilmFacts(BaseModel):
@@ -72,7 +76,7 @@ class Tracked(BaseModel):
     fps: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
     """Frames per second, by the times of the frames used."""
 
-    warnings: Annotated[tuple[Words, ...], Field(max_length=100)]
+    warnings: Warnings
 
 
 def check_film(
@@ -101,6 +105,7 @@ def check_film(
     return _answer(FilmFacts, ended, bounds, bounds.check_seconds)
 
 
+OnWarnings = Callable[[tuple[str, ...]], None]
 OnProgress = Callable[[float, tuple[int, int] | None, FollowedPoints | None], None]
 
 MOST = 1 << 24
@@ -115,12 +120,14 @@ def track_film(
     bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
     threads: int = 1,
     on_progress: OnProgress | None = None,
+    on_warnings: OnWarnings | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Tracked:
     """Track a film; write `tracks.npz`, `contact_sheet.jpg` and unless too large `film_frames.bin` to the empty scratch folder.
 
     `on_progress` receives the completed share in [0, 1], the numbers of frames and points if known, and the points just tracked,
-    if any. `should_stop` is called ten times a second; the film process is killed once it returns True.
+    if any. `on_warnings` receives the warnings known so far, each time there are more. `should_stop` is called ten times a second; the
+    film process is killed once it returns True.
 
     Raises
     ------
@@ -135,6 +142,8 @@ def track_film(
         done = stated.get("done")
         if on_progress is not None and isinstance(done, int | float) and 0 <= done <= 1:
             on_progress(float(done), believed_size(stated.get("observations")), _followed(stated.get("followed")))
+        if on_warnings is not None and "warnings" in stated:
+            on_warnings(believed_warnings(stated["warnings"]))
 
     ended = _run("track", source, options, bounds, scratch, threads=threads, on_line=on_line, should_stop=should_stop)
     if ended.stopped:
@@ -148,6 +157,14 @@ def believed_size(stated: object) -> tuple[int, int] | None:
         case [int(frames), int(points)] if 0 < frames <= MOST and 0 < points <= MOST:
             return frames, points
     return None
+
+
+def believed_warnings(stated: object) -> tuple[str, ...]:
+    """Return the warnings reported by the film process, none if invalid."""
+    try:
+        return WARNINGS.validate_python(stated)
+    except ValidationError:
+        return ()
 
 
 def _followed(stated: object) -> FollowedPoints | None:
