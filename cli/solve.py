@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -60,7 +61,16 @@ def solve(
         else:
             parts = {"tracks": tracks, "mesh": file_or_word(mesh), "ground_truth": ground_truth, "rotations": rotations}
             done = solve_tracks(parts, output, options=options, name=name, threads=threads, as_json=as_json)
-    show_finished(done, output, as_json=as_json)
+    show_finished(replace(done, warnings=(*done.warnings, *warnings_of_others(output, done))), output, as_json=as_json)
+
+
+def warnings_of_others(output: Path, done: Finished) -> list[str]:
+    """Return a warning if a folder also contains files of another result, which this one does not replace."""
+    from pliant.worker.artifacts.kinds import KINDS
+
+    written = {artifact.name for artifact in done.artifacts}
+    others = [kind.name for kind in KINDS if kind.name not in written and (output / kind.name).exists()]
+    return [f"{output} also contains {', '.join(others)}, not written by this command."] if others else []
 
 
 def files_of(options: dict[str, Any], *, film: bool) -> list[str]:
