@@ -80,28 +80,44 @@ class Tried:
 
 
 def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) -> list[Tried]:
-    """Return the isometries tried: from the first focal length downhill by `FOCAL_STEP` and, unless `given`, within the bracket."""
+    """Return the isometries tried: from the first focal length downhill by `FOCAL_STEP` and, unless `given`, within the bracket.
+
+    The search ends early if the minimum is outside `FOCAL_RANGE`.
+    """
     first = tried_at(search, focal, None)
     if first is None:
         return []
     tried = [first]
-    low, high = FOCAL_RANGE[0] * diagonal, FOCAL_RANGE[1] * diagonal
     while not search.stopped:
-        least = min(tried, key=lambda each: each.found.inconsistency)
-        ahead = [least.focal * FOCAL_STEP, least.focal / FOCAL_STEP]
-        wanted = [f for f in ahead if low <= f <= high and not any(abs(np.log(t.focal / f)) < 1e-6 for t in tried)]
-        if not wanted:
+        least = least_of(tried)
+        if not FOCAL_RANGE[0] * diagonal <= least.focal <= FOCAL_RANGE[1] * diagonal:
+            return tried
+        further = _beside(search, tried, least)
+        if not further:
             break
-        tried += [each for each in (tried_at(search, f, least) for f in wanted) if each is not None]
+        tried += further
     values = [each.found.inconsistency for each in tried]
     if not given and max(values) - min(values) >= RISE:
-        tried += _golden(search, min(tried, key=lambda each: each.found.inconsistency))
-        least = min(tried, key=lambda each: each.found.inconsistency)
-        for side in (-1, 1):  # the new minimum may lack a neighbour at the distance of a step
-            if not any(side * np.log(t.focal / least.focal) >= 0.9 * np.log(FOCAL_STEP) for t in tried):
-                further = tried_at(search, least.focal * FOCAL_STEP**side, least)
-                tried += [further] if further is not None else []
+        tried += _golden(search, least_of(tried))
+        tried += _beside(
+            search, tried, least_of(tried)
+        )  # the new minimum may lack a neighbour at the distance of a step
     return tried
+
+
+def least_of(tried: list[Tried]) -> Tried:
+    """Return the focal length with the least I."""
+    return min(tried, key=lambda each: each.found.inconsistency)
+
+
+def _beside(search: FocalSearch, tried: list[Tried], least: Tried) -> list[Tried]:
+    """Return the isometries one step on either side of the minimum, unless that side has been tried at this distance or farther."""
+    missing = [
+        side for side in (1, -1)
+        if not any(side * np.log(t.focal / least.focal) >= 0.9 * np.log(FOCAL_STEP) for t in tried)
+    ]  # fmt: skip
+    found = [tried_at(search, least.focal * FOCAL_STEP**side, least) for side in missing]
+    return [each for each in found if each is not None]
 
 
 def _golden(search: FocalSearch, middle: Tried) -> list[Tried]:

@@ -2,21 +2,21 @@
 
 Minimise Σ_fe ρ(‖x_fi − x_fj‖ − l_e) over log depths ζ and edge lengths l, x_fi = exp(ζ_fi) r_fi. ρ is the soft-L1 loss
 ε² (√(1 + (r/ε)²) − 1), which limits the influence of observations that do not move with the surface. Σ l_e is kept constant, which fixes
-the free scale. Gauss–Newton steps with Levenberg–Marquardt damping; the normal equations are solved by conjugate gradients with a
-block-diagonal preconditioner, one block per frame, because only the lengths couple the frames.
+the free scale. Gauss–Newton steps with Levenberg–Marquardt damping. Only the lengths couple the frames, so the depths of each frame are
+eliminated from the normal equations (Triggs et al., "Bundle Adjustment – A Modern Synthesis", 2000, section 6.1), and conjugate gradients
+solve the reduced equations of the lengths.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from pliant.solver.isometry.inextensible import SurfaceGraph
 from pliant.solver.records import Floats
 from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, cg, splu
+from scipy.sparse.linalg import LinearOperator, cg
 
 CONVERGED = 1e-4
 """Relative decrease of the objective below which refinement ends."""
@@ -154,7 +154,7 @@ def _lower(graph: SurfaceGraph, here: _Point, damping: float, ease: float) -> tu
     gradient = weighted.T @ here.residuals
     factor = 0.1  # 1 after a failed step, so that the damping that succeeds is kept
     while damping <= MOST_DAMPED:
-        move = _step(normal, gradient, damping, graph.seen.sum(axis=1))
+        move = gauss_newton_step(graph, normal, gradient, damping)
         log_depths = here.log_depths + move[: len(here.log_depths)]
         lengths = here.lengths + move[len(here.log_depths) :]
         total = float(lengths.sum())
@@ -167,29 +167,41 @@ def _lower(graph: SurfaceGraph, here: _Point, damping: float, ease: float) -> tu
     return None, damping
 
 
-def _step(normal: sparse.csr_matrix, gradient: Floats, damping: float, counts: Floats) -> Floats:
-    """Solve (N + damping · diag N) x = −g by preconditioned conjugate gradients."""
-    diagonal = normal.diagonal()
-    added = damping * diagonal + 1e-12 * float(diagonal.max())
-    bounds = np.concatenate([[0], np.cumsum(counts)])
-    spans = [slice(int(a), int(b)) for a, b in pairwise(bounds) if b > a]
-    blocks = [
-        splu((normal[s, s] + sparse.diags(added[s])).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-             options={"SymmetricMode": True})
-        for s in spans
-    ]  # fmt: skip
+def gauss_newton_step(graph: SurfaceGraph, normal: sparse.csr_matrix, gradient: Floats, damping: float) -> Floats:
+    """Solve (N + damping · diag N) x = −g for x of shape `(O + E,)`.
 
-    def precondition(x: Floats) -> Floats:
-        y = x / (diagonal + added)
-        for span, block in zip(spans, blocks, strict=True):
-            y[span] = block.solve(x[span])
-        return y
+    Depths are eliminated exactly, frame by frame, and lengths found by conjugate gradients, to a relative residual of 1e-3. With blocks A
+    of the depths, D of the lengths (diagonal) and B between them, the lengths solve (D − BᵀA⁻¹B) l = BᵀA⁻¹g_ζ − g_l.
+    """
+    diagonal = normal.diagonal()
+    diagonal += damping * diagonal + 1e-12 * float(diagonal.max())
+    count = int(graph.seen.sum())
+    between, weights = normal[:count, count:], diagonal[count:]
+    across = between.T.tocsr()
+    inverse = np.linalg.inv(_blocks(graph, normal[:count, :count], diagonal[:count]))
+
+    def eliminated(right: Floats) -> Floats:
+        wide = np.zeros(graph.seen.shape)
+        wide[graph.seen] = right
+        return np.asarray((inverse @ wide[:, :, None])[:, :, 0][graph.seen])
 
     def multiply(x: Floats) -> Floats:
-        return np.asarray(normal @ x + added * x)
+        return np.asarray(weights * x - across @ eliminated(between @ x))
 
-    shape = normal.shape
-    operator = LinearOperator(shape, matvec=multiply, dtype=np.float64)
-    inverse = LinearOperator(shape, matvec=precondition, dtype=np.float64)
-    move, _ = cg(operator, -gradient, rtol=1e-3, maxiter=100, M=inverse)
-    return np.asarray(move)
+    shape = (len(weights), len(weights))
+    reduced = LinearOperator(shape, matvec=multiply, dtype=np.float64)
+    scaled = LinearOperator(shape, matvec=lambda x: x / weights, dtype=np.float64)
+    lengths, _ = cg(reduced, across @ eliminated(gradient[:count]) - gradient[count:], rtol=1e-3, maxiter=100, M=scaled)
+    return np.concatenate([-eliminated(gradient[:count] + between @ lengths), lengths])
+
+
+def _blocks(graph: SurfaceGraph, depths: sparse.csr_matrix, diagonal: Floats) -> Floats:
+    """Return the block of every frame, shape `(F, A, A)`, from the equations of the visible depths; 1 on the diagonal of hidden ones."""
+    frames, anchors = graph.seen.shape
+    frame, anchor = np.nonzero(graph.seen)
+    entries = depths.tocoo()
+    blocks = np.zeros((frames, anchors, anchors))
+    blocks[:, np.arange(anchors), np.arange(anchors)] = 1.0
+    blocks[frame[entries.row], anchor[entries.row], anchor[entries.col]] = entries.data
+    blocks[frame, anchor, anchor] = diagonal
+    return blocks

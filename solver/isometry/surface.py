@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pliant.solver.isometry.anchors import choose_anchors, connected, nearest_neighbours, unlike_frames
 from pliant.solver.isometry.confirmation import DISAGREEMENT, deformation, disagreement
 from pliant.solver.isometry.extension import Extended, complete_anchors, extend, flatten
-from pliant.solver.isometry.focal_sweep import CLEAR, FocalSearch, Tried, judged, sweep
+from pliant.solver.isometry.focal_sweep import CLEAR, FocalSearch, Tried, judged, least_of, sweep
 from pliant.solver.isometry.homographies import off_homography
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import Isometry, edge_lengths, inconsistency, refine, typical
@@ -158,7 +158,7 @@ def isometric_surface(
         return IsometricVerdict("Stopped before the test for isometry had finished.", _trace(tried))
     if not tried:
         return IsometricVerdict("No isometric surface was found: the conic program has no solution.", _trace(tried))
-    least = min(tried, key=lambda each: each.found.inconsistency)
+    least = least_of(tried)
     clear, why = judged(tried, least)
     chosen = least if focal is None else tried[0]
     if clear:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +10,20 @@ import pytest
 from pliant.solver import InvalidInput, InvalidSettings, KnownCamera, Outcome, Settings, Tracks, gallery, solve
 from pliant.solver.evaluation.metrics import reprojection
 from pliant.solver.evaluation.trust import per_frame
+from pliant.solver.isometry import focal_sweep
 from pliant.solver.isometry.anchors import Anchors, connected, nearest_neighbours
 from pliant.solver.isometry.extension import complete_anchors, flatten, spline
+from pliant.solver.isometry.focal_sweep import FocalSearch, Tried
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
-from pliant.solver.isometry.refinement import edge_lengths, inconsistency, refine, residuals, typical
+from pliant.solver.isometry.refinement import (
+    Isometry,
+    edge_lengths,
+    gauss_newton_step,
+    inconsistency,
+    refine,
+    residuals,
+    typical,
+)
 from pliant.solver.isometry.surface import isometric_surface
 from rolled_sheets import CENTRE, FOCAL, SIZE, one_scale_error, rolled
 
@@ -41,6 +52,60 @@ def test_the_jacobian_matches_finite_differences() -> None:
         step = 1e-6 * np.eye(len(x))[column]
         high, low = (residuals(graph, y[:count], y[count:])[0] for y in (x + step, x - step))
         np.testing.assert_allclose(jacobian[:, column], (high - low) / 2e-6, atol=1e-8)
+
+
+def test_a_step_solves_the_damped_normal_equations() -> None:
+    graph, depths = graph_of()
+    graph = replace(graph, seen=np.random.default_rng(0).random(graph.seen.shape) < 0.7)
+    count = int(graph.seen.sum())
+    left, jacobian = residuals(graph, np.log(depths[graph.seen]), 1.1 * typical(edge_lengths(graph, depths)))
+    weighted = (jacobian.multiply(np.random.default_rng(1).uniform(0.1, 1, len(left))[:, None])).tocsr()
+    normal, gradient = (jacobian.T @ weighted).tocsr(), weighted.T @ left
+    found = gauss_newton_step(graph, normal, gradient, 0.01)
+    matrix = normal.toarray() + 0.01 * np.diag(normal.diagonal())
+    rest = matrix @ found + gradient
+    np.testing.assert_allclose(rest[:count], 0, atol=1e-9 * np.abs(gradient).max())
+    reduced = gradient[count:] - matrix[count:, :count] @ np.linalg.solve(matrix[:count, :count], gradient[:count])
+    assert np.linalg.norm(rest[count:]) < 2e-3 * np.linalg.norm(reduced)
+
+
+def with_inconsistencies(monkeypatch: pytest.MonkeyPatch, of_focal: Callable[[float], float]) -> list[float]:
+    """Let I be a function of the focal length; return the list of those that are tried."""
+    focals: list[float] = []
+
+    def tried_at(search: object, focal: float, near: object) -> Tried:
+        focals.append(focal)
+        return Tried(focal, Isometry(np.ones((2, 3)), np.ones(3), of_focal(focal)))
+
+    monkeypatch.setattr(focal_sweep, "tried_at", tried_at)
+    return focals
+
+
+SEARCH = FocalSearch(
+    Anchors(np.ones((2, 3, 2)), np.ones((2, 3), bool), 0.0),
+    edges=np.zeros((1, 2), np.intp), seen=np.ones((2, 3), bool), frames=np.arange(2), centre=np.zeros(2), should_stop=None,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("true", [430.0, 800.0, 2300.0])
+def test_the_focal_sweep_finds_a_minimum_and_tries_its_neighbours(monkeypatch: pytest.MonkeyPatch, true: float) -> None:
+    with_inconsistencies(monkeypatch, lambda focal: 0.002 + 0.02 * float(np.log(focal / true)) ** 2)
+    tried = focal_sweep.sweep(SEARCH, 1000.0, 1200.0, given=False)
+    least = focal_sweep.least_of(tried)
+    assert least.focal == pytest.approx(true, rel=0.02)
+    assert focal_sweep.judged(tried, least)[0]
+
+
+@pytest.mark.parametrize("power", [2.0, -2.0])
+def test_a_minimum_outside_the_range_of_focal_lengths_is_not_searched_for(
+    monkeypatch: pytest.MonkeyPatch, power: float
+) -> None:
+    focals = with_inconsistencies(monkeypatch, lambda focal: 0.002 * (focal / 1000) ** power)
+    tried = focal_sweep.sweep(SEARCH, 1000.0, 1200.0, given=False)
+    low, high = (1200 * bound for bound in focal_sweep.FOCAL_RANGE)
+    outside = [focal for focal in focals if not low <= focal <= high]
+    assert outside == [focal_sweep.least_of(tried).focal] == focals[-1:]
+    assert not focal_sweep.judged(tried, focal_sweep.least_of(tried))[0]
 
 
 def test_refinement_recovers_the_true_depths_of_a_rigid_plane() -> None:
