@@ -26,11 +26,11 @@ With other options, the solver alone, processor s (estimate); the constants were
     30 × 5,000           2.1 (3.1)         2.2 (3.1)   .8 (1.9)
 
 With `image_size`, where perspective is found, relative to the same face far away (`python -m benchmarks.installation.cost --near`; the
-estimate is 1.9):
+estimate is 1.5):
 
     frames × points   noise   noise, 20 % hidden
-    50 × 500            3.4                  3.5
-    100 × 300           2.8                  2.7
+    50 × 500            2.1                  2.4
+    100 × 300           1.7                  1.8
 
 With blocks of larger overlap, the solver alone took 11.6 GB and 520 processor seconds for 100 × 1,000,000, estimated at 17 GB and 814 s.
 Not covered: sparsely observed points, which take 80 bytes times the square of their number; and time with other options.
@@ -58,9 +58,9 @@ SECONDS = 0.5
 LEARNING = {(True, False): 0.13, (True, True): 0.045, (False, False): 0.045, (False, True): 0.005}
 """Processor seconds per frame from which cameras and prior are learned, by (whether the prior is learned, whether rotations are given)."""
 
-LENS = 2.0
+LENS = 1.5
 """Factor of `LEARNING` where perspective may be found because picture size or lens is known: between the 1.0 to 1.1 of tracks without
-perspective and the 2.7 to 3.5 of those with it."""
+perspective and the 1.7 to 2.4 of those with it."""
 
 MICROSECONDS = 8.0
 """Processor time per observation."""
