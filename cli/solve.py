@@ -67,9 +67,11 @@ def solve(
 def warnings_of_others(output: Path, done: Finished) -> list[str]:
     """Return a warning if a folder also contains files of another result, which this one does not replace."""
     from pliant.worker.artifacts.kinds import KINDS
+    from pliant.worker.execution.film import FILES
 
-    written = {artifact.name for artifact in done.artifacts}
-    others = [kind.name for kind in KINDS if kind.name not in written and (output / kind.name).exists()]
+    written = {artifact.name for artifact in done.artifacts} | {"tracks.npz"}  # which may be the input
+    names = [*(kind.name for kind in KINDS), *FILES]
+    others = [name for name in names if name not in written and (output / name).exists()]
     return [f"{output} also contains {', '.join(others)}, not written by this command."] if others else []
 
 

@@ -190,7 +190,11 @@ class Options(Chosen):
         description="Time limit of the job in seconds, after which it fails with timed_out; null: only the service's own limit.",
     )
     fps: float = Field(
-        25.0, gt=0, le=1000, allow_inf_nan=False, description="Frames per second of the written animation."
+        25.0,
+        gt=0,
+        le=1000,
+        allow_inf_nan=False,
+        description="Frames per second of the written animation. For a film, the default is its own rate.",
     )
     outputs: Outputs = Field(
         ("glb", "ply", "csv"),

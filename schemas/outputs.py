@@ -18,7 +18,7 @@ class OutputRequest(Chosen):
         description="Files to write: glb, ply, obj, usd, abc, mdd, mat, csv; see the option `outputs` of a job."
     )
     fps: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] | None = Field(
-        None, description="Frames per second of the written animation."
+        None, description="Frames per second of the written animation; null: as in the job."
     )
     normals: Literal["static", "animated", "none"] | None = Field(None, description="As in the options of a job.")
     colours: Literal["none", "error", "expected_error"] | None = Field(None, description="As in the options of a job.")

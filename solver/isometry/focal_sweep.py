@@ -34,7 +34,7 @@ FOCAL_STEP = 1.5
 """Ratio of neighbouring focal lengths."""
 
 FOCAL_RANGE = (0.2, 6.0)
-"""Range of focal lengths searched, in image diagonals."""
+"""Range of focal lengths searched, in image diagonals. The search may end one step beyond it, to bracket a minimum near its ends."""
 
 GOLDEN_STEPS = 4
 """Evaluations of golden-section search, which narrow the bracket to about ±10 % before the parabola is fitted."""
@@ -80,29 +80,40 @@ class Tried:
 
 
 def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) -> list[Tried]:
-    """Return the isometries tried: from the first focal length downhill by `FOCAL_STEP` and, unless `given`, within the bracket.
+    """Return the isometries tried: downhill from the first focal length by `FOCAL_STEP`, at most one step beyond `FOCAL_RANGE`.
 
-    The search ends early if the minimum is outside `FOCAL_RANGE`.
+    Unless `given`, the bracket of the minimum is then searched, if a minimum there could be accepted.
     """
     first = tried_at(search, focal, None)
     if first is None:
         return []
     tried = [first]
+    low, high = (
+        min(FOCAL_RANGE[0] * diagonal, focal),
+        max(FOCAL_RANGE[1] * diagonal, focal),
+    )  # a given one may be outside
     while not search.stopped:
         least = least_of(tried)
-        if not FOCAL_RANGE[0] * diagonal <= least.focal <= FOCAL_RANGE[1] * diagonal:
-            return tried
+        if not low <= least.focal <= high:
+            break
         further = _beside(search, tried, least)
         if not further:
             break
         tried += further
-    values = [each.found.inconsistency for each in tried]
-    if not given and max(values) - min(values) >= RISE:
+    if not given and _may_be_accepted(tried):
         tried += _golden(search, least_of(tried))
         tried += _beside(
             search, tried, least_of(tried)
         )  # the new minimum may lack a neighbour at the distance of a step
     return tried
+
+
+def _may_be_accepted(tried: list[Tried]) -> bool:
+    """Whether `judged` could accept a minimum within one step of the least I: none of the neighbours it will have is below `RISE`."""
+    least = least_of(tried)
+    values = [each.found.inconsistency for each in tried]
+    apart = [t for t in tried if abs(np.log(t.focal / least.focal)) >= 1.9 * np.log(FOCAL_STEP)]
+    return max(values) - min(values) >= RISE and all(each.found.inconsistency >= RISE for each in apart)
 
 
 def least_of(tried: list[Tried]) -> Tried:

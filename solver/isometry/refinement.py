@@ -168,10 +168,10 @@ def _lower(graph: SurfaceGraph, here: _Point, damping: float, ease: float) -> tu
 
 
 def gauss_newton_step(graph: SurfaceGraph, normal: sparse.csr_matrix, gradient: Floats, damping: float) -> Floats:
-    """Solve (N + damping · diag N) x = −g for x of shape `(O + E,)`.
+    """Solve (N + damping · diag N) x = −g for x of shape `(O + E,)`; 1e-12 of the largest entry is added to the diagonal.
 
-    Depths are eliminated exactly, frame by frame, and lengths found by conjugate gradients, to a relative residual of 1e-3. With blocks A
-    of the depths, D of the lengths (diagonal) and B between them, the lengths solve (D − BᵀA⁻¹B) l = BᵀA⁻¹g_ζ − g_l.
+    Depths are eliminated exactly, frame by frame, and lengths found by conjugate gradients, to a relative residual of 1e-3. With the damped
+    blocks A of the depths and D of the lengths (diagonal), and B between them, the lengths solve (D − BᵀA⁻¹B) l = BᵀA⁻¹g_ζ − g_l.
     """
     diagonal = normal.diagonal()
     diagonal += damping * diagonal + 1e-12 * float(diagonal.max())

@@ -51,6 +51,7 @@ def test_a_film_is_solved_and_its_tracks_are_written_beside_the_shapes(film: Pat
     assert words.count("No region was given") == 1
     assert words.count("Only 5 frames are tracked") == 1
     assert words.index("No region was given") < words.index("metric")
+    assert "also contains" not in words
 
 
 def test_warnings_of_a_film_are_printed_once_before_its_points_are_followed(

@@ -264,7 +264,10 @@ def test_solve_leaves_files_that_it_does_not_write(run: Run, tracks: Path) -> No
     ran = run("solve", tracks, "-o", tracks.parent, "-O", 'outputs=["mat"]', *FAST)
     assert ran.exit_code == 0, ran.output
     assert (tracks.parent / "shapes.mdd").read_text() == "mine"
-    assert f"warning {tracks.parent} also contains shapes.mdd, not written by this command." in words(ran)
+    assert (
+        f"warning {tracks.parent} also contains shapes.mdd, contact_sheet.jpg, not written by this command."
+        in words(ran)
+    )
 
 
 def test_demo_replaces_files_in_a_named_folder_only_if_forced(

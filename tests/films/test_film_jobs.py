@@ -35,6 +35,7 @@ from pliant.worker.execution.film import reconstruct_film, solving_seconds
 from pliant.worker.execution.pace import MachinePace
 from pliant.worker.films import frame_strip, tracker
 from pliant.worker.films.bounds import FilmBounds
+from pliant.worker.films.contained_process import SHARES
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.sources import FilmSource, is_source, looks_like_film, open_source, save_source
 from pliant.worker.films.tracker import (
@@ -166,6 +167,21 @@ def test_a_film_of_many_cuts_has_a_short_warning(film: Path) -> None:
     warnings = tuple(warnings_before(open_film(film), found, 0, 6, whole=False, rough=1.0))
     assert "The film has 499 cuts (the first at frame 6). Only frames 0 to 5 are tracked." in warnings[0]
     assert Tracked(container="matroska", fps=30.0, warnings=warnings).warnings == warnings
+
+
+def test_a_cut_is_reported_before_the_points_are_followed(tmp_path: Path) -> None:
+    one, other = (films.textured_pictures(10, (96, 72), seed=seed) for seed in (0, 7))
+    cut = films.write_film(tmp_path / "cut.mkv", one + other)
+    (tmp_path / "scratch").mkdir()
+    shares, known = [0.0], dict[str, float]()
+    tracked = track_film(
+        FilmSource(cut), Options(grid_step=6), tmp_path / "scratch",
+        on_progress=lambda done, size, followed: shares.append(done),
+        on_warnings=lambda warnings: known.update((each, shares[-1]) for each in warnings if each not in known),
+    )  # fmt: skip
+    assert list(known)[:2] == list(tracked.warnings[:2])
+    assert "The film has a cut (at frame 10)" in list(known)[1]
+    assert known[list(known)[1]] <= SHARES["read"][1] < shares[-1]
 
 
 def test_each_exit_of_the_film_process_maps_to_an_error() -> None:

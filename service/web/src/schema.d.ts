@@ -698,7 +698,7 @@ export interface components {
             time_limit: number | null;
             /**
              * Fps
-             * @description Frames per second of the written animation.
+             * @description Frames per second of the written animation. For a film, the default is its own rate.
              * @default 25
              */
             fps: number;
@@ -1136,7 +1136,7 @@ export interface components {
             outputs: ("glb" | "ply" | "obj" | "usd" | "abc" | "mdd" | "mat" | "csv")[];
             /**
              * Fps
-             * @description Frames per second of the written animation.
+             * @description Frames per second of the written animation; null: as in the job.
              * @default null
              */
             fps: number | null;

@@ -56,13 +56,20 @@ def test_the_jacobian_matches_finite_differences() -> None:
 
 def test_a_step_solves_the_damped_normal_equations() -> None:
     graph, depths = graph_of()
-    graph = replace(graph, seen=np.random.default_rng(0).random(graph.seen.shape) < 0.7)
+    seen = np.random.default_rng(0).random(graph.seen.shape) < 0.7
+    seen[1], seen[2], seen[:, 3] = (
+        False,
+        np.arange(seen.shape[1]) == 4,
+        False,
+    )  # a hidden frame, a single point, a hidden point
+    graph = replace(graph, seen=seen)
     count = int(graph.seen.sum())
     left, jacobian = residuals(graph, np.log(depths[graph.seen]), 1.1 * typical(edge_lengths(graph, depths)))
     weighted = (jacobian.multiply(np.random.default_rng(1).uniform(0.1, 1, len(left))[:, None])).tocsr()
     normal, gradient = (jacobian.T @ weighted).tocsr(), weighted.T @ left
     found = gauss_newton_step(graph, normal, gradient, 0.01)
-    matrix = normal.toarray() + 0.01 * np.diag(normal.diagonal())
+    diagonal = normal.diagonal()
+    matrix = normal.toarray() + np.diag(0.01 * diagonal + 1e-12 * diagonal.max())
     rest = matrix @ found + gradient
     np.testing.assert_allclose(rest[:count], 0, atol=1e-9 * np.abs(gradient).max())
     reduced = gradient[count:] - matrix[count:, :count] @ np.linalg.solve(matrix[:count, :count], gradient[:count])
@@ -87,24 +94,43 @@ SEARCH = FocalSearch(
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("true", [430.0, 800.0, 2300.0])
+DIAGONAL = 1200.0
+
+
+@pytest.mark.parametrize("true", [0.21, 0.36, 0.67, 1.9, 4.3, 5.5])
 def test_the_focal_sweep_finds_a_minimum_and_tries_its_neighbours(monkeypatch: pytest.MonkeyPatch, true: float) -> None:
-    with_inconsistencies(monkeypatch, lambda focal: 0.002 + 0.02 * float(np.log(focal / true)) ** 2)
-    tried = focal_sweep.sweep(SEARCH, 1000.0, 1200.0, given=False)
+    with_inconsistencies(monkeypatch, lambda focal: 0.002 + 0.02 * float(np.log(focal / (true * DIAGONAL))) ** 2)
+    tried = focal_sweep.sweep(SEARCH, 0.8 * DIAGONAL, DIAGONAL, given=False)
     least = focal_sweep.least_of(tried)
-    assert least.focal == pytest.approx(true, rel=0.02)
+    assert least.focal == pytest.approx(true * DIAGONAL, rel=0.05)
     assert focal_sweep.judged(tried, least)[0]
 
 
+@pytest.mark.parametrize("given", [0.1, 0.15, 7.0, 20.0])
+def test_an_improbable_focal_length_is_compared_with_others(monkeypatch: pytest.MonkeyPatch, given: float) -> None:
+    with_inconsistencies(monkeypatch, lambda focal: 0.002 + 0.02 * float(np.log(focal / 800)) ** 2)
+    tried = focal_sweep.sweep(SEARCH, given * DIAGONAL, DIAGONAL, given=True)
+    assert tried[0].focal == given * DIAGONAL
+    assert focal_sweep.least_of(tried).focal == pytest.approx(800, rel=0.25)
+
+
 @pytest.mark.parametrize("power", [2.0, -2.0])
-def test_a_minimum_outside_the_range_of_focal_lengths_is_not_searched_for(
-    monkeypatch: pytest.MonkeyPatch, power: float
-) -> None:
-    focals = with_inconsistencies(monkeypatch, lambda focal: 0.002 * (focal / 1000) ** power)
-    tried = focal_sweep.sweep(SEARCH, 1000.0, 1200.0, given=False)
-    low, high = (1200 * bound for bound in focal_sweep.FOCAL_RANGE)
-    outside = [focal for focal in focals if not low <= focal <= high]
-    assert outside == [focal_sweep.least_of(tried).focal] == focals[-1:]
+def test_the_focal_sweep_ends_one_step_beyond_its_range(monkeypatch: pytest.MonkeyPatch, power: float) -> None:
+    focals = with_inconsistencies(monkeypatch, lambda focal: 0.02 * (focal / 1000) ** power)
+    focal_sweep.sweep(SEARCH, 0.8 * DIAGONAL, DIAGONAL, given=True)
+    low, high = (DIAGONAL * bound for bound in focal_sweep.FOCAL_RANGE)
+    assert [focal for focal in focals if not low <= focal <= high] == focals[-1:]
+
+
+@pytest.mark.parametrize("floor", [0.0, 0.0015])
+def test_no_minimum_is_refined_that_would_not_be_accepted(monkeypatch: pytest.MonkeyPatch, floor: float) -> None:
+    def flat(focal: float) -> float:
+        return floor + 0.0004 * float(np.log(focal / 500)) ** 2 + (0.02 if focal > 2000 else 0.0)
+
+    focals = with_inconsistencies(monkeypatch, flat)
+    tried = focal_sweep.sweep(SEARCH, 2.0 * DIAGONAL, DIAGONAL, given=False)
+    steps = np.log(np.array(focals) / focals[0]) / np.log(focal_sweep.FOCAL_STEP)
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
     assert not focal_sweep.judged(tried, focal_sweep.least_of(tried))[0]
 
 

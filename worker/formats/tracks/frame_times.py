@@ -10,7 +10,7 @@ from pliant.worker.formats.records import Arrays
 ARRAY = "frame_times"
 
 MAX_SECONDS = 1e7
-"""Latest time of a frame; four months."""
+"""Longest time from the first to the last frame; four months."""
 
 
 def read_frame_times(arrays: Arrays, frames: int, *, field: str) -> NDArray[np.float64] | None:
@@ -19,7 +19,7 @@ def read_frame_times(arrays: Arrays, frames: int, *, field: str) -> NDArray[np.f
     Raises
     ------
     InvalidInput
-        Code damaged_file: not F increasing times.
+        Code damaged_file: not F finite, increasing times, or more than `MAX_SECONDS` between the first and the last.
     """
     given = arrays.get(ARRAY)
     if given is None:
@@ -27,8 +27,10 @@ def read_frame_times(arrays: Arrays, frames: int, *, field: str) -> NDArray[np.f
     if given.shape != (frames,):
         raise damaged(field, f"{ARRAY} of shape {given.shape} beside tracks of {frames} frames")
     times = given.astype(np.float64)
-    if not (np.isfinite(times).all() and np.abs(times).max() <= MAX_SECONDS and (np.diff(times) > 0).all()):
+    if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
         raise damaged(field, f"{ARRAY} that do not increase")
+    if frames > 1 and times[-1] - times[0] > MAX_SECONDS:
+        raise damaged(field, f"{ARRAY} over {times[-1] - times[0]:.3g} seconds")
     return times
 
 
