@@ -13,6 +13,8 @@ const PICTURES: [RegExp, string][] = [
 ];
 /** Timeout for decoding the first frame, milliseconds; after it, the browser is assumed unable to decode the film. */
 const PATIENCE = 25_000;
+/** Attempts at decoding the first frame. On a busy machine, Chromium fails for one film in a hundred that it can decode. */
+const ATTEMPTS = 3;
 
 /** Return true for a media type or name of a film, and for a zip without arrays. */
 export function looksLikeFilm(file: File, entries: Entry[]): boolean {
@@ -35,11 +37,16 @@ export async function firstFrame(file: File): Promise<ImageBitmap | null> {
   try {
     if (/\.gif$/i.test(file.name)) return await createImageBitmap(file);
     if (/\.zip$/i.test(file.name)) return await pictureAt(file, (await pictures(file))[0]);
-    return await decoded(file);
   } catch (error) {
     if (unreadable(error)) return null;
     throw error;
   }
+  const end = performance.now() + PATIENCE;
+  for (let attempt = 0; attempt < ATTEMPTS; attempt += 1) {
+    const picture = await decoded(file, end - performance.now());
+    if (picture !== null) return picture;
+  }
+  return null;
 }
 
 /** The inspections of films, kept for those that this browser cannot decode. */
@@ -75,7 +82,9 @@ export async function pictureAt(file: File, member: Member | undefined): Promise
   return picture && createImageBitmap(picture);
 }
 
-async function decoded(file: File): Promise<ImageBitmap | null> {
+/** Return the first frame of a video, or null if it is not decoded within so many milliseconds. */
+async function decoded(file: File, patience: number): Promise<ImageBitmap | null> {
+  if (patience <= 0) return null;
   const video = document.createElement("video");
   video.muted = true;
   video.playsInline = true;
@@ -83,7 +92,7 @@ async function decoded(file: File): Promise<ImageBitmap | null> {
   const url = URL.createObjectURL(file);
   try {
     const shown = await new Promise<boolean>((resolve) => {
-      const timer = setTimeout(() => resolve(false), PATIENCE);
+      const timer = setTimeout(() => resolve(false), patience);
       const settle = (answer: boolean): void => {
         clearTimeout(timer);
         resolve(answer);
@@ -92,7 +101,7 @@ async function decoded(file: File): Promise<ImageBitmap | null> {
       video.addEventListener("error", () => settle(false));
       video.src = url;
     });
-    return shown ? await createImageBitmap(video) : null;
+    return shown ? await createImageBitmap(video).catch(() => null) : null;
   } finally {
     video.removeAttribute("src");
     video.load();

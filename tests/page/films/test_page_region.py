@@ -124,6 +124,23 @@ def test_keys_work_after_a_click_on_a_button_of_the_dialog(filming: Page, films:
     expect(filming.get_by_role("dialog")).to_have_count(0)
 
 
+FAILS_ONCE = """() => {
+  const real = window.createImageBitmap;
+  let failed = false;
+  window.createImageBitmap = (source, ...more) => {
+    if (failed || !(source instanceof HTMLVideoElement)) return real(source, ...more);
+    failed = true;
+    return Promise.reject(new DOMException("no picture yet", "InvalidStateError"));
+  };
+}"""
+
+
+def test_decoding_the_first_frame_is_tried_again(filming: Page, films: dict[str, bytes]) -> None:
+    filming.evaluate(FAILS_ONCE)
+    drop(filming, {"film.webm": films["film.webm"]})
+    expect(filming.get_by_role("button", name="Draw a region")).to_be_visible()
+
+
 def test_touch_screens_show_no_keyboard_hint(browser: Browser, url: str, films: dict[str, bytes]) -> None:
     context = browser.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
     page = context.new_page()
