@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.factorization import upgrades
 from pliant.solver.cameras.multistart import CANDIDATES
-from pliant.solver.cameras.perspective import Perspective, centred, columns, corrected, depth_map, depths_of
-from pliant.solver.model.expectation_maximisation import annealed
+from pliant.solver.cameras.perspective import Perspective, corrected, depth_map, depths_of
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.so3 import MIRROR, nearest
 from pliant.solver.records import Floats
 from pliant.solver.refinement.focal_length import refined_with_focal
-from pliant.solver.refinement.learned import Learned
+from pliant.solver.refinement.learned import Learned, annealed_at
 from pliant.solver.tracks.frame_selection import evenly_spread
 
 ALTERNATION_ROUNDS = 3
@@ -134,17 +133,11 @@ def aligned(rotations: Floats, like: Floats, used: NDArray[np.intp]) -> Floats:
 def _relearned(view: Perspective, found: Learned, used: NDArray[np.intp], model_order: ModelOrder) -> Learned:
     views = view.sample[used]
     depths = depths_of(depth_map(found.rotations, found.scales, found.covariance), views, view.curvature)
-    rows = columns(centred(corrected(views, depths, view.curvature)))
-    projections = found.rotations[:, :2] * found.scales[:, None, None]
-    covariance = annealed(
-        rows @ rows.T / rows.shape[1],
-        projections,
-        max_modes=model_order.max_modes,
-        noisy_start=model_order.noisy_start,
-        ordered=model_order.ordered,
+    again = annealed_at(
+        corrected(views, depths, view.curvature), found.rotations, found.scales, model_order,
         iterations=ALTERNATION_EM_ROUNDS,
-    )
-    return replace(found, covariance=covariance)
+    )  # fmt: skip
+    return replace(found, covariance=again.covariance)
 
 
 def _with_focal(

@@ -14,6 +14,7 @@ from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR
 from pliant.solver.records import Floats, read_only
+from pliant.solver.refinement.affine_iterations import affine_iterations
 from pliant.solver.refinement.bas_relief import LOG_DEPTH_STD
 from pliant.solver.refinement.depth_alternation import alternated, factorized_again
 from pliant.solver.refinement.focal_length import search
@@ -66,16 +67,45 @@ def settled(
     )  # fmt: skip
     if not view.bends:
         return replace(estimate, perspective=view)
+    reached, best = _converged(
+        estimate, normalized, used, found, view, model_order=model_order, turning=turning, should_stop=should_stop
+    )
+    if not turning or is_planar(reached.gram):
+        return reached
+    reached, best = _restarted(reached, normalized, used, best, model_order=model_order, should_stop=should_stop)
+    start = affine_iterations(
+        view.sample[used], rotations[used], scales[used], view, model_order=model_order, should_stop=should_stop
+    )
+    if start is None:
+        return reached
+    found, curvature = start
+    other, found = _converged(
+        estimate, normalized, used, found, replace(view, curvature=curvature),
+        model_order=model_order, turning=True, should_stop=should_stop,
+    )  # fmt: skip
+    other, found = _restarted(other, normalized, used, found, model_order=model_order, should_stop=should_stop)
+    return other if found.energy < best.energy - MIN_GAIN else reached
+
+
+def _converged(
+    estimate: CameraEstimate,
+    normalized: Normalized,
+    used: NDArray[np.intp],
+    found: Learned,
+    view: Perspective,
+    *,
+    model_order: ModelOrder,
+    turning: bool,
+    should_stop: Callable[[], bool] | None,
+) -> tuple[CameraEstimate, Learned]:
+    """Return the estimate with the tracks corrected after alternation from `found` and κ, with κ positive where z points away."""
     if view.curvature * view.signs[0] < 0:
         view = replace(view, curvature=-view.curvature, flipped=-1)
         turned, covariance = mirrored(found.rotations, found.covariance)
         found = replace(found, rotations=turned, covariance=covariance)
-        estimate = replace(estimate, rotations=MIRROR @ rotations @ MIRROR)
+        estimate = replace(estimate, rotations=MIRROR @ np.asarray(estimate.rotations) @ MIRROR)
     found, view = alternated(view, found, used, model_order=model_order, turning=turning, should_stop=should_stop)
-    settled_estimate = _applied(estimate, normalized, used, found, view)
-    if not turning or is_planar(settled_estimate.gram):
-        return settled_estimate
-    return _restarted(settled_estimate, normalized, used, found, model_order=model_order, should_stop=should_stop)
+    return _applied(estimate, normalized, used, found, view), found
 
 
 def _restarted(
@@ -86,10 +116,10 @@ def _restarted(
     *,
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None = None,
-) -> CameraEstimate:
+) -> tuple[CameraEstimate, Learned]:
     """Return the estimate after alternations from cameras of the corrected tracks, repeated while the evidence rises.
 
-    `found` holds the estimate's cameras and covariance at the frames used.
+    `found` holds the estimate's cameras and covariance at the frames used, and is returned refined.
     """
     wide = np.repeat(np.asarray(estimate.scales), 2)
     for _ in range(RESTARTS):
@@ -108,7 +138,7 @@ def _restarted(
         estimate, found = _applied(replace(estimate, rotations=rotations), normalized, used, other, moved), other
         if gain < MIN_GAIN:
             break
-    return estimate
+    return estimate, found
 
 
 def settled_again(

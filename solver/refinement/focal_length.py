@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.solver.cameras.perspective import (
     Candidate,
     Perspective,
@@ -29,13 +30,12 @@ from pliant.solver.cameras.perspective import (
     depth_map,
     depths_of,
 )
-from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.image_density import factor_of
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, UNLIKELY, Motion, energy_with_inverse
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.records import Floats
-from pliant.solver.refinement.learned import Learned, motion_of, moved_to, scene_at, stretched
+from pliant.solver.refinement.learned import Learned, annealed_at, motion_of, moved_to, scene_at, stretched
 from pliant.solver.tracks.frame_selection import evenly_spread
 from scipy.optimize import minimize
 
@@ -106,8 +106,7 @@ def search(
     should_stop : callable, optional
         Called between values of κ; once it returns True, the best so far is used.
     """
-    count = max(min(SEARCH_FRAMES, len(views), views.shape[1] // 2), 3)
-    used = evenly_spread(len(views), count)
+    used = compared_frames(views)
     comparison = _Comparison.of(views[used], rotations[used], scales[used], model_order, turning=turning)
 
     def stopped() -> bool:
@@ -129,6 +128,11 @@ def search(
     return view, stretched(found, used, rotations)
 
 
+def compared_frames(views: Floats) -> NDArray[np.intp]:
+    """Return the indices of the frames on which values of κ are compared, given tracks `(F, S, 2)`."""
+    return evenly_spread(len(views), max(min(SEARCH_FRAMES, len(views), views.shape[1] // 2), 3))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Comparison:
     """Values of κ compared on some frames; each continues from a neighbour."""
@@ -142,13 +146,8 @@ class _Comparison:
         cls, views: Floats, rotations: Floats, scales: Floats, model_order: ModelOrder, *, turning: bool
     ) -> _Comparison:
         """Learn the covariance for κ = 0 from scratch."""
-        rows = columns(centred(views))
-        covariance = annealed(
-            rows @ rows.T / rows.shape[1], rotations[:, :2] * scales[:, None, None], max_modes=model_order.max_modes,
-            noisy_start=model_order.noisy_start, ordered=model_order.ordered, iterations=SEARCH_EM_ROUNDS,
-        )  # fmt: skip
         comparison = cls(views, turning, {})
-        flat = _Trial(0.0, np.inf, Learned(rotations, scales, covariance, np.inf))
+        flat = _Trial(0.0, np.inf, annealed_at(views, rotations, scales, model_order, iterations=SEARCH_EM_ROUNDS))
         comparison.trials[0.0] = comparison._continued(flat, 0.0)
         return comparison
 

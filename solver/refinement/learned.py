@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.model.expectation_maximisation import learned
+from pliant.solver.cameras.perspective import centred, columns
+from pliant.solver.model.expectation_maximisation import annealed, learned
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, fit, metric_of, root_of
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import AXIS_VARIANCE_FLOOR, NOISE_VARIANCE_FLOOR, ShapeCovariance
@@ -118,6 +119,22 @@ def learned_at(
         ordered=model_order.ordered,
         iterations=iterations,
         should_stop=should_stop,
+    )
+    return Learned(rotations, scales, covariance, np.inf)
+
+
+def annealed_at(
+    images: Floats, rotations: Floats, scales: Floats, model_order: ModelOrder, *, iterations: int
+) -> Learned:
+    """Return given cameras and a covariance learned for them from scratch, by annealing, from orthographic tracks `(F, S, 2)`."""
+    rows = columns(centred(images))
+    covariance = annealed(
+        rows @ rows.T / rows.shape[1],
+        rotations[:, :2] * scales[:, None, None],
+        max_modes=model_order.max_modes,
+        noisy_start=model_order.noisy_start,
+        ordered=model_order.ordered,
+        iterations=iterations,
     )
     return Learned(rotations, scales, covariance, np.inf)
 
