@@ -41,6 +41,7 @@ def view(
             listening.bind(("127.0.0.1", port))
         except OSError as fault:
             raise BadArgument(f"--port: cannot listen on {port}: {fault.strerror}. Choose another, or 0.") from None
+        listening.listen()  # a browser that is faster than the server waits instead of being refused
         url = f"http://127.0.0.1:{listening.getsockname()[1]}/{token}/#view=local"
         if as_json:
             print_json({"url": url})

@@ -171,6 +171,20 @@ def test_view_rejects_folders_without_a_result_and_busy_ports(run: Run, folder: 
             read_result(tmp_path)
 
 
+def test_the_viewer_listens_before_the_browser_opens(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = []
+
+    def visit(url: str) -> None:
+        opened.append(url)
+        socket.create_connection(("127.0.0.1", httpx.URL(url).port or 0), timeout=5).close()
+
+    monkeypatch.setattr("webbrowser.open", visit)
+    monkeypatch.setattr("uvicorn.Server.run", lambda *_, **__: None)
+    ran = run("view", folder)
+    assert ran.exit_code == Exit.DONE, ran.output
+    assert opened == [ran.stdout.strip()]
+
+
 @pytest.mark.slow
 def test_view_runs_until_ctrl_c(folder: Path) -> None:
     command = [sys.executable, "-m", "pliant.cli", "view", str(folder / "shapes.npz"), "--no-browser", "--json"]
@@ -181,8 +195,6 @@ def test_view_runs_until_ctrl_c(folder: Path) -> None:
             text += viewing.stdout.readline()
         url: Any = json.loads(text)["url"]
         address = url.partition("#")[0]
-        answers = httpx.Client(transport=httpx.HTTPTransport(retries=5))
-        assert answers.get(f"{address}v1/jobs/local").json()["id"] == "local"
-        answers.close()
+        assert httpx.get(f"{address}v1/jobs/local").json()["id"] == "local"
         viewing.send_signal(signal.SIGINT)
         assert viewing.wait(20) == Exit.DONE
