@@ -1,0 +1,78 @@
+"""Kinds of objects that constants were not chosen on: what they promise, resumed measurements, and the table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pliant.solver.evaluation.metrics import e3d_frame_scaled
+
+from benchmarks.accuracy import kinds
+from benchmarks.rows import append_row, rows
+
+
+@pytest.mark.parametrize("kind", list(kinds.KINDS))
+def test_every_kind_deforms_smoothly(kind: str) -> None:
+    shapes = kinds.KINDS[kind](np.random.default_rng(0))
+    assert shapes.shape == (kinds.FRAMES, 41 if kind == "figure" else kinds.POINTS, 3)
+    assert np.isfinite(shapes).all()
+    size = np.abs(shapes - shapes.mean(axis=1, keepdims=True)).max()
+    assert e3d_frame_scaled(np.broadcast_to(shapes.mean(axis=0), shapes.shape), shapes) > 0.02
+    assert np.abs(np.diff(shapes, axis=0)).max() < 0.5 * size
+
+
+def test_lengths_along_the_paper_are_constant() -> None:
+    sheet = kinds.paper(np.random.default_rng(0)).reshape(kinds.FRAMES, 12, 12, 3)
+    for axis in (1, 2):
+        lengths = np.linalg.norm(np.diff(sheet, axis=axis), axis=3)
+        assert np.abs(lengths / lengths.mean(axis=0) - 1).max() < 0.005  # chords of the arcs between points
+
+
+@pytest.mark.parametrize("path", list(kinds.PATHS))
+def test_images_are_those_of_a_pinhole_camera(path: str) -> None:
+    near, truth = kinds.sequence("arm", path, 4.0, 0.0)
+    far, same = kinds.sequence("arm", path, np.inf, 0.0)
+    np.testing.assert_array_equal(truth, same)
+    centre = (np.array(kinds.PICTURE) - 1) / 2
+    assert np.abs(truth).max() == pytest.approx(kinds.HALF_SIZE)
+    np.testing.assert_allclose(far.points - centre, truth[..., :2], atol=1e-9)
+    np.testing.assert_allclose(
+        (near.points - centre) * (1 + truth[..., 2:] / (4 * kinds.HALF_SIZE)), truth[..., :2], atol=1e-9
+    )
+
+
+def test_measurements_are_resumed_and_tabulated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[tuple[str, str, float]] = []
+
+    def measured(kind: str, path: str, distance: float, noise: float) -> dict[str, object]:
+        asked.append((kind, path, distance))
+        shown = distance if np.isfinite(distance) else None
+        return {
+            "kind": kind, "path": path, "distance": shown, "noise": noise, "e3d_frame_scaled": 0.0124, "flat": 0.3,
+            "rigid": 0.2, "verdict": "good", "seconds": 1.0,
+        }  # fmt: skip
+
+    monkeypatch.setattr(kinds, "measured", measured)
+    out = ["--out", str(tmp_path / "kinds.jsonl")]
+    kinds.main(["--only", "arm line", *out])
+    kinds.main(["--only", "arm line", *out])
+    assert asked == [("arm", "line", 4.0), ("arm", "line", np.inf)]
+    capsys.readouterr()
+    kinds.main(["--table", *out])
+    assert capsys.readouterr().out.splitlines()[2:] == [
+        "| arm | 4 |  |  |  |  | .012 (.200) |  |",
+        "| arm | ∞ |  |  |  |  | .012 (.200) |  |",
+    ]
+
+
+@pytest.mark.slow
+def test_a_measurement_has_the_errors_of_trivial_answers(tmp_path: Path) -> None:
+    row = kinds.measured("tearing", "circle", np.inf, 0.3)
+    assert row["e3d_frame_scaled"] < 0.5 * min(row["flat"], row["rigid"])
+    assert row["focal_error"] is None
+    assert row["distance"] is None
+    append_row(tmp_path / "kinds.jsonl", row)
+    assert "| tearing | ∞ |" in kinds.table(rows(tmp_path / "kinds.jsonl"))
