@@ -66,7 +66,7 @@ def affine_iterations(
     scales : array, shape (F,)
         Scales, which are kept.
     view : Perspective
-        Result of the search: given κ, signs of κ to try, and `candidates`.
+        Result of the search: its κ with `candidates`, given κ, and signs of κ to try.
     model_order : ModelOrder
         Maximum number of modes, and the starting noise.
     should_stop : callable, optional
@@ -86,7 +86,7 @@ def affine_iterations(
     best = min(trials, key=lambda trial: trial.nll)
     if view.given is None:
         best = _continued(part, best)
-    if best.nll >= min(each.nll for each in view.candidates):
+    if best.nll >= min((each.nll for each in view.candidates if each.curvature == view.curvature), default=np.inf):
         return None
     every = _Iterations(views, rotations, scales, model_order)
     return every.iterated(best.size, best.curvature, every.factorized(best.size)).found, best.curvature

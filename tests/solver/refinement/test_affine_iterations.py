@@ -70,7 +70,7 @@ def test_the_result_hardly_depends_on_the_other_cameras(hinge: tuple[Floats, Per
 
 def test_a_more_probable_search_is_kept(hinge: tuple[Floats, Perspective]) -> None:
     rotations, view = hinge
-    better = replace(view, candidates=(Candidate(0.1, -np.inf),))
+    better = replace(view, curvature=0.1, candidates=(Candidate(0.1, -np.inf),))
     assert affine_iterations(view.sample, rotations, np.ones(FRAMES), better, model_order=ModelOrder()) is None
 
 
