@@ -16,8 +16,8 @@ from pliant.solver.records import Floats
 
 DISAGREEMENT = 0.02
 """Maximum relative difference of edge lengths between half of the frames and all. Measured: paper .001, a comic page .002, paper with 1 px
-of noise, 10 % outliers and 30 % hidden .003, rolled cylinder .002, paper that turns by up to 360° .002 to .007; a head that turns by 90°
-.03, an orthographic flag 1.6 and 5.9, a face 8.2 and 8.9."""
+of noise, 10 % outliers and 30 % hidden .003, rolled cylinder .002, made-up paper seen from up to 360° .002 to .007; a head that turns by
+90° .03, an orthographic flag 1.6 and 5.9, a face 8.2 and 8.9."""
 
 ALIGNMENTS = 10
 """Alternations between the rigid shape and the rotations of the frames."""

@@ -25,8 +25,8 @@ RESTARTS = 3
 """Maximum number of restarts of the alternation from cameras of the corrected tracks; the evidence converges after one or two."""
 
 MIN_GAIN = 0.01
-"""Decrease of the energy, per point and frame, below which no further restart is tried: equal solutions from different starts differ by
-as much."""
+"""Decrease of the energy, per point and frame, below which no further restart is tried and another start is not preferred: equal solutions
+from different starts differ by as much."""
 
 
 def settled(
