@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -15,8 +16,8 @@ from browsing import differing_pixels, why_not
 from paging import DONE, QUICK, TRACKS, packed, seek, until
 from PIL import Image
 from playwright.sync_api import Browser, Locator, Page, expect
-from pliant.solver import KnownCamera, solve
-from pliant.solver.gallery import corrupt, flag
+from pliant.solver import KnownCamera, Solution, solve
+from pliant.solver.gallery import Sequence, corrupt, flag
 from pliant.worker.artifacts.preview import write_preview
 from pliant.worker.formats.texture import Texture
 
@@ -232,31 +233,52 @@ def test_another_job_is_compared_side_by_side(viewer: Page) -> None:
     expect(other).to_have_count(0)
 
 
-def painted() -> bytes:
-    """A preview of a flag textured red on the left and blue on the right; its depth has the wrong sign."""
+@pytest.fixture(scope="module")
+def solved() -> tuple[Sequence, Solution]:
+    """The clean flag and its solution."""
     sequence = flag(FRAMES, POINTS)
     cameras = KnownCamera.from_arrays(sequence.rotations, sequence.scales)
-    solution = solve(sequence.tracks, sequence.mesh, cameras=cameras)
-    first = sequence.tracks.points[0]
-    places = (first - first.min(axis=0)) / np.ptp(first, axis=0)
-    halves = np.zeros((64, 64, 3), dtype=np.uint8)
-    halves[:, :32, 0] = halves[:, 32:, 2] = 230
+    return sequence, solve(sequence.tracks, sequence.mesh, cameras=cameras)
+
+
+def preview_of(solved: tuple[Sequence, Solution], **given: Any) -> bytes:
+    sequence, solution = solved
     into = io.BytesIO()
-    write_preview(
-        into,
-        tracks=sequence.tracks,
-        mesh=sequence.mesh,
-        solution=solution,
-        truth=solution.shapes * (1, 1, -1),
-        texture=Texture.from_tracked(halves, places),
-    )
+    write_preview(into, tracks=sequence.tracks, mesh=sequence.mesh, solution=solution, **given)
     return into.getvalue()
 
 
-def test_film_texture_is_the_default_and_returns_after_a_comparison(
-    page: Page, url: str, jobs: tuple[str, str]
+def painted(solved: tuple[Sequence, Solution]) -> bytes:
+    """A preview of a flag textured red on the left and blue on the right; its depth has the wrong sign."""
+    first = solved[0].tracks.points[0]
+    places = (first - first.min(axis=0)) / np.ptp(first, axis=0)
+    halves = np.zeros((64, 64, 3), dtype=np.uint8)
+    halves[:, :32, 0] = halves[:, 32:, 2] = 230
+    return preview_of(solved, truth=solved[1].shapes * (1, 1, -1), texture=Texture.from_tracked(halves, places))
+
+
+def test_a_film_of_uneven_frame_rate_plays_at_its_own_times(
+    page: Page, url: str, jobs: tuple[str, str], solved: tuple[Sequence, Solution]
 ) -> None:
-    preview = painted()
+    seconds = np.r_[
+        np.arange(FRAMES - 1) / 20, 600.0
+    ]  # at the mean rate the second frame would be shown after a minute
+    preview = preview_of(solved, uneven_times=seconds)
+    page.route(f"**/{jobs[0]}/**/preview.bin", lambda route: route.fulfill(body=preview))
+    page.goto(f"{url}/#job={jobs[0]}")
+    canvas(page).wait_for(timeout=DONE)
+    seek(page, 0)
+    page.get_by_role("button", name="Play", exact=True).click()
+    slider = page.get_by_role("slider", name="Frame")
+    until(lambda: float(slider.input_value()) >= FRAMES - 2)
+    page.get_by_role("button", name="Pause", exact=True).click()
+    assert FRAMES - 2 <= float(slider.input_value()) < FRAMES - 1.5
+
+
+def test_film_texture_is_the_default_and_returns_after_a_comparison(
+    page: Page, url: str, jobs: tuple[str, str], solved: tuple[Sequence, Solution]
+) -> None:
+    preview = painted(solved)
     page.route(f"**/{jobs[0]}/**/preview.bin", lambda route: route.fulfill(body=preview))
     page.goto(f"{url}/#job={jobs[0]}")
     colour = page.get_by_label("Colour", exact=True)

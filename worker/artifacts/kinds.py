@@ -162,6 +162,7 @@ def _preview(result: Result, file: IO[bytes]) -> None:
         truth=None if inputs.ground_truth is None else inputs.ground_truth.shapes,
         y_axis=inputs.interpretation.y_axis,
         fps=result.options.fps,
+        uneven_times=result.uneven_times,
         image_size=result.options.image_size,
         point_names=inputs.point_names,
         texture=inputs.texture,

@@ -21,6 +21,7 @@ frames     float32 (F, 6)      translation x, y; hidden share; expected error an
 points     uint32 (P, 2)       number of frames, of all, that show each point, and number in which it was rejected
 spread     uint16 (F, P)       standard deviation of a position = spread_step · value. Only with a posterior
 rejected   uint8 (F, ⌈P/8⌉)    bits, the lowest first: seen observations that the solver rejected as outliers
+times      float32 (F,)        seconds of every frame from the first. Only for films of uneven frame rate
 names      UTF-8, P lines      names of the points. Only where the tracks' file has them
 places     float32 (P, 2)      position of every point in the picture, 0 to 1: u right, v down. Only for films
 picture    JPEG                the film's template frame. Only for films
@@ -134,14 +135,15 @@ def write_preview(
     truth: Floats | None = None,
     y_axis: str = "down",
     fps: float = 25.0,
+    uneven_times: Floats | None = None,
     image_size: str | None = None,
     point_names: Sequence[str] | None = None,
     texture: Texture | None = None,
 ) -> None:
     """Write the file from tracks, solution and, if known, the truth `(F, P, 3)`, in any axes, NaN where unknown.
 
-    `y_axis` is the direction of the image's y axis; `fps` is the rate before frames are skipped; `image_size` is WIDTHxHEIGHT, as in the
-    option.
+    `y_axis` is the direction of the image's y axis; `fps` is the rate before frames are skipped; `uneven_times` holds the seconds of every
+    frame, `(F,)`, of a film that does not have this rate throughout; `image_size` is WIDTHxHEIGHT, as in the option.
     """
     stride = max(1, -(-solution.shapes[..., 0].size // MOST_OBSERVATIONS))
     facing, mirrored = (None, False) if truth is None else _onto(solution.shapes, truth)
@@ -164,6 +166,8 @@ def write_preview(
         "image_size": None if image_size is None else [float(side) for side in image_size.split("x")],
     }
     sections = [Section.of("faces", faces), *_sections(tracks, solution, truth, facing, kept, rounding)]
+    if uneven_times is not None:
+        sections.append(Section.of("times", uneven_times[kept].astype("<f4")))
     _write(file, header, [*sections, *_input_sections(point_names, texture)])
 
 

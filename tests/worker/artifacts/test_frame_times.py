@@ -21,7 +21,8 @@ RATE = 6 / (TIMES[-1] - TIMES[0])
 def write(folder: Path, *, times: np.ndarray | None, fps: float, outputs: str) -> Path:
     if outputs == "abc":
         pytest.importorskip("alembic3d", reason="no wheel for this Python")
-    inputs, solution, options = make_result(outputs=outputs, fps=fps)
+    # The preview is written whatever the outputs.
+    inputs, solution, options = make_result(outputs="csv" if outputs == "preview" else outputs, fps=fps)
     inputs = replace(inputs, frame_times=times)
     report = build_report(inputs, solution, options, metrics={}, seconds={})
     folder.mkdir(exist_ok=True)
@@ -77,7 +78,15 @@ def _csv(folder: Path) -> Any:
         return [float(row["seconds"]) for row in csv.DictReader(file)]
 
 
-READERS = {"glb": _glb, "usd": _usd, "abc": _abc, "mdd": _mdd, "csv": _csv}
+def _preview(folder: Path) -> Any:
+    content = (folder / "preview.bin").read_bytes()
+    header = json.loads(content[16 : 16 + struct.unpack_from("<I", content, 12)[0]])
+    if "times" not in header["sections"]:  # then the page plays at the rate
+        return np.arange(header["num_frames"]) / header["fps"]
+    return np.frombuffer(content, "<f4", header["num_frames"], header["sections"]["times"]["offset"])
+
+
+READERS = {"glb": _glb, "usd": _usd, "abc": _abc, "mdd": _mdd, "csv": _csv, "preview": _preview}
 
 
 @pytest.mark.parametrize("kind", READERS)

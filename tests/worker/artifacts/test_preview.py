@@ -63,6 +63,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         "points": ("<u4", (points, 2)),
         "spread": ("<u2", (frames, points)),
         "rejected": ("u1", (frames, -1)),
+        "times": ("<f4", (frames,)),
         "places": ("<f4", (points, 2)),
         "picture": ("u1", (-1,)),
     }
@@ -190,10 +191,11 @@ def test_a_long_sequence_is_subsampled_evenly_and_keeps_its_speed(
     monkeypatch.setattr(preview, "MOST_OBSERVATIONS", F * P // 2)
     path = tmp_path / preview.NAME
     solution = solution_of(sequence)
-    write(path, tracks=sequence.tracks, mesh=None, solution=solution, fps=30)
+    write(path, tracks=sequence.tracks, mesh=None, solution=solution, fps=30, uneven_times=np.arange(F) ** 2.0)
     header, arrays = read(path)
     assert (header["num_frames"], header["frame_stride"], header["fps"]) == (3, 2, 15)
     np.testing.assert_allclose(world(header, arrays["positions"]), solution.shapes[::2], atol=header["step"])
+    np.testing.assert_array_equal(arrays["times"], [0, 4, 16])
 
 
 def test_quads_become_triangles_of_the_same_orientation() -> None:

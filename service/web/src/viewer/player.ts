@@ -1,6 +1,7 @@
 // Playback: the current time of the animation, and how it advances.
 
 import { h } from "../dom";
+import type { Clock } from "./clock";
 import { choice, group } from "./controls";
 
 export type Ending = "loop" | "back and forth" | "once";
@@ -16,7 +17,7 @@ export class Player {
 
   constructor(
     private readonly frames: number,
-    private readonly fps: number,
+    private readonly clock: Clock,
     private readonly onTime: () => void,
     private readonly onStop: () => void,
   ) {}
@@ -45,25 +46,23 @@ export class Player {
     // A background tab gets no animation frames; playback continues where it stopped, without catching up.
     const passed = Math.min(0.25, (now - this.before) / 1000);
     this.before = now;
-    this.time += this.direction * passed * this.fps * this.speed;
-    this.turnAround();
+    this.time = this.clock.frame(this.turnedAround(this.clock.seconds(this.time) + this.direction * passed * this.speed));
     this.onTime();
     if (this.playing) requestAnimationFrame(this.tick);
   };
 
-  private turnAround(): void {
-    const last = this.frames - 1;
+  /** Return the seconds at which playback continues, from seconds that may be before the first or after the last frame. */
+  private turnedAround(seconds: number): number {
+    const { last } = this.clock;
     if (this.ending !== "back and forth") this.direction = 1;
-    if (this.time >= 0 && this.time <= last) return;
+    if (seconds >= 0 && seconds <= last) return seconds;
     if (this.ending === "back and forth") {
-      this.direction = this.time > last ? -1 : 1;
-      this.time = this.time > last ? Math.max(0, 2 * last - this.time) : Math.min(last, -this.time);
-    } else if (this.ending === "loop") {
-      this.time %= last;
-    } else {
-      this.time = last;
-      this.pause();
+      this.direction = seconds > last ? -1 : 1;
+      return seconds > last ? Math.max(0, 2 * last - seconds) : Math.min(last, -seconds);
     }
+    if (this.ending === "loop") return seconds % last;
+    this.pause();
+    return last;
   }
 }
 

@@ -4,6 +4,7 @@
 // residuals and ground truth are fetched by byte range when first needed.
 
 import { Refusal, call, headers, reached } from "../api";
+import { Clock } from "./clock";
 
 const MAGIC = "PLIANTPV";
 const PREFIX = 16;
@@ -47,6 +48,7 @@ interface Header {
     points?: Section;
     spread?: Section;
     rejected?: Section;
+    times?: Section;
     names?: Section;
     places?: Section;
     picture?: Section;
@@ -113,6 +115,8 @@ export class Preview {
     private readonly frameTable: Float32Array,
     /** 2 per point: number of frames in which it is visible, and in which it is rejected; empty in files of older services. */
     private readonly pointTable: Uint32Array,
+    /** When each frame is shown. */
+    readonly clock: Clock,
     signal: AbortSignal,
   ) {
     this.positions = new Int16Array(3 * header.num_points * header.num_frames);
@@ -141,11 +145,12 @@ export class Preview {
     if (header.version !== 1) throw new Error("The preview was written by a newer version; reload the page.");
     const { faces, cameras } = header.sections;
     const none = { offset: faces.offset, bytes: 0 };
-    const { frames = none, points = none } = header.sections;
-    const [tables, frameTable, pointTable] = await Promise.all([
+    const { frames = none, points = none, times = none } = header.sections;
+    const [tables, frameTable, pointTable, timeTable] = await Promise.all([
       range(url, faces.offset, cameras.offset + cameras.bytes - faces.offset, signal),
       frames.bytes > 0 ? range(url, frames.offset, frames.bytes, signal) : new Uint8Array(),
       points.bytes > 0 ? range(url, points.offset, points.bytes, signal) : new Uint8Array(),
+      times.bytes > 0 ? range(url, times.offset, times.bytes, signal) : new Uint8Array(),
     ]);
     const preview = new Preview(
       url,
@@ -154,6 +159,7 @@ export class Preview {
       new Float32Array(aligned(tables, cameras.offset - faces.offset, cameras.bytes)),
       new Float32Array(aligned(frameTable, 0, frames.bytes)),
       new Uint32Array(aligned(pointTable, 0, points.bytes)),
+      times.bytes > 0 ? new Clock(new Float32Array(aligned(timeTable, 0, times.bytes))) : Clock.even(header.num_frames, header.fps),
       signal,
     );
     const first = new Promise<void>((resolve) => (preview.onFrames = resolve));

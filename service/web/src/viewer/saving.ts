@@ -15,7 +15,7 @@ export interface Saveable {
   preview: string;
   film: string | undefined;
   usdz: string | undefined;
-  /** Duration of the sequence at its frame rate. */
+  /** Duration of the sequence. */
   seconds: number;
   background: () => string;
   canvases: () => HTMLCanvasElement[];

@@ -86,7 +86,7 @@ export class Viewer {
     this.stage = new Stage(this.view, preview);
     this.body = new Body(preview, preview.positions);
     this.stage.add(this.body.group);
-    this.player = new Player(preview.frames, preview.header.fps, () => this.moved(), () => this.showState());
+    this.player = new Player(preview.frames, preview.clock, () => this.moved(), () => this.showState());
     this.probe = new Probe(preview, this.leaving.signal, () => this.stage.redraw());
     this.stage.add(this.probe.marker);
     this.timeline = new Timeline(preview, (frame) => this.seek(frame));
@@ -170,7 +170,7 @@ export class Viewer {
       preview: sources.preview,
       film: this.film ? sources.film : undefined,
       usdz: sources.usdz,
-      seconds: preview.frames / preview.header.fps,
+      seconds: preview.clock.duration,
       background: () => getComputedStyle(this.view).getPropertyValue("--back-1").trim(),
       canvases: () => this.canvases(),
       pose: (share, kind) => this.pose(share, kind),
@@ -380,8 +380,8 @@ export class Viewer {
 
   /** Set the view for a share of a recorded film: one turn around the object, or the sequence through its cameras. */
   private pose(share: number, kind: "turntable" | "camera"): HTMLCanvasElement[] {
-    const { frames } = this.preview;
-    this.player.time = Math.min(frames - 1, share * (frames - 1));
+    const { clock } = this.preview;
+    this.player.time = clock.frame(share * clock.last);
     this.scrub.value = String(this.player.time);
     this.timeline.show(this.player.time);
     if (kind === "camera") this.following = true;
