@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from pliant.solver.descent import OVERHEAD, expected_iterations, expected_reweightings
-from pliant.solver.limits import LEARNED_FRAMES
+from pliant.solver.limits import LEARNED_FRAMES, learned_frames
 from pliant.solver.records import Floats
 
 UNIT_SECONDS, FRAME_SECONDS = 7e-5, 1.3e-5
@@ -62,13 +62,13 @@ GRAM_SECONDS = 1e-9
 
 UNITS = {
     "multistart": (1600, 120, 1.3),
-    "model_order": (1000, 360, 0.6),
+    "model_order": (1000, LEARNED_FRAMES, 0.6),
     "starts": (2140, 40, 0.85),
-    "perspective": (10, 360, 30.0),
+    "perspective": (10, LEARNED_FRAMES, 30.0),
     "scales": (820, 120, 0.85),
-    "refinement": (1500, 360, 1.1),
-    "observations": (184, 360, 6.0),
-    "covariance": (380, 360, 1.0),
+    "refinement": (1500, LEARNED_FRAMES, 1.1),
+    "observations": (184, LEARNED_FRAMES, 6.0),
+    "covariance": (380, LEARNED_FRAMES, 1.0),
     "extension": (80, 1_000_000, 3.0),
     "trust": (10, 100, 60.0),
 }
@@ -137,7 +137,7 @@ def planned(
     first = [Stage("surface", SURFACE_SECONDS * min(frames, 24), 280, setup=SURFACE_SETUP)] if sheet else []
     most_frames, most_points = MOST_COMPLETED
     filled = COMPLETION_SECONDS * frames * min(frames, most_frames) * min(points, most_points) if unseen > 0 else 0.0
-    filled += GRAM_SECONDS * min(frames, LEARNED_FRAMES) ** 2 * points
+    filled += GRAM_SECONDS * learned_frames(frames) ** 2 * points
     first.append(Stage("completion", 0.1 + filled, 6, growth=RANK_GROWTH))
     learned = learning(frames, gaussian=gaussian, known_cameras=known_cameras, known_scales=known_scales)
     return (*first, *learned, start, shapes, *last)
@@ -179,7 +179,7 @@ def _longer(scales: Stage) -> Stage:
 def stage_of(name: str, frames: int) -> Stage:
     """Return the stage `name` of `UNITS` for a number of frames."""
     units, most_frames, cost = UNITS[name]
-    used = min(frames, most_frames)
+    used = min(frames if name == "extension" else learned_frames(frames), most_frames)
     curved = 1 + used / CUBIC_FRAMES[name] if name in CUBIC_FRAMES else 1.0
     return Stage(name, units * cost * curved * (UNIT_SECONDS + FRAME_SECONDS * used), units)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pliant.solver.cameras import estimation
 from pliant.solver.cameras.estimation import CameraEstimate, given_cameras
 from pliant.solver.cameras.planar_ambiguity import is_planar
-from pliant.solver.limits import LEARNED_FRAMES
+from pliant.solver.limits import LEARNED_FRAMES, learned_stride
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.monitor import Monitor, enter
 from pliant.solver.pulse import pulses_to
@@ -112,9 +112,9 @@ def estimate_cameras(
 def cameras_of(observations: Observations, monitor: Monitor) -> Cameras:
     """Return the cameras of the observations; `monitor` counts units of work and may request a stop."""
     shown, settings = informative_frames(observations.normalized.visible), observations.settings
-    long = settings.gaussian and len(shown) > LEARNED_FRAMES
+    long = settings.gaussian and settings.order == "film" and learned_stride(len(shown)) > 1
     # Evenly spaced, as the motion priors assume.
-    used = np.flatnonzero(shown)[:: -(-int(shown.sum()) // LEARNED_FRAMES)] if long else np.arange(len(shown))
+    used = np.flatnonzero(shown)[:: learned_stride(int(shown.sum()))] if long else np.arange(len(shown))
     part = observations.at(used) if long else observations
     estimate = _without_shapes(part, monitor)
     if settings.gaussian and estimate.outliers > OUTLIER_SHARE and not monitor():

@@ -14,6 +14,7 @@ from pliant.solver import (
     estimate_cameras,
     gallery,
     learn_prior,
+    limits,
     solve,
     solve_shapes,
 )
@@ -21,13 +22,13 @@ from pliant.solver.cameras import perspective
 from pliant.solver.evaluation import metrics
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
-from pliant.solver.reconstruction import cameras, long_films
+from pliant.solver.reconstruction import long_films
 
 FRAMES, LEARNED = 120, 20
 
 
 def learn_from(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cameras, "LEARNED_FRAMES", frames)
+    monkeypatch.setattr(limits, "LEARNED_FRAMES", frames)
     monkeypatch.setattr(perspective, "LEARNED_FRAMES", frames)
 
 

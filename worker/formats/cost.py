@@ -40,7 +40,7 @@ from __future__ import annotations
 
 from pliant.schemas.job import Estimate
 from pliant.schemas.options import Options
-from pliant.solver.limits import BLOCK_OBSERVATIONS, LEARNED_FRAMES
+from pliant.solver.limits import BLOCK_OBSERVATIONS, learned_frames
 
 LIBRARIES = 110_000_000
 """Bytes of a job process before it reads its inputs."""
@@ -71,7 +71,7 @@ def estimated(num_frames: int, num_points: int, options: Options, *, has_rotatio
     observations = num_frames * num_points
     learns = options.prior == "gaussian" and options.method == "robust" and options.preset == "auto"
     at_once = int(min(observations, _largest_block(options)))
-    learning = LEARNING[learns, has_rotations] * min(num_frames, LEARNED_FRAMES)
+    learning = LEARNING[learns, has_rotations] * learned_frames(num_frames)
     if learns and _may_be_perspective(options):
         learning *= LENS
     return Estimate(
