@@ -136,3 +136,19 @@ def test_factored_depth_map_matches_the_dense_matrix(monkeypatch: pytest.MonkeyP
     assert isinstance(matrix, np.ndarray)
     assert isinstance(factors, perspective.DepthMap)
     assert factors @ images == pytest.approx(matrix @ images, abs=1e-8)
+
+
+@pytest.mark.parametrize("frames", [1, 239, 240, 241, 480, 481, 1102, 10_000])
+def test_every_nth_frame_is_learned_from_with_the_smallest_n(frames: int) -> None:
+    stride = limits.learned_stride(frames)
+    assert limits.learned_frames(frames) == len(range(0, frames, stride)) <= limits.LEARNED_FRAMES
+    assert stride == 1 or frames / (stride - 1) > limits.LEARNED_FRAMES
+
+
+@pytest.mark.usefixtures("limited")
+@pytest.mark.slow
+def test_photographs_are_all_learned_from(film: gallery.Sequence) -> None:
+    first = Tracks.from_arrays(film.tracks.points[: 2 * LEARNED], film.tracks.visible[: 2 * LEARNED])
+    found = {order: estimate_cameras(first, settings=Settings(order=order)) for order in ("film", "any")}
+    assert f"These are {LEARNED} of {2 * LEARNED} frames" in found["film"].reasons["rotations"]
+    assert "resection" not in found["any"].reasons["rotations"]
