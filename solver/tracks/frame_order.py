@@ -32,8 +32,7 @@ MAX_PAIRS, MAX_POINTS = 200, 2000
 """Maximum numbers of frame pairs and of points compared; they bound time and memory."""
 
 MAX_UNORDERED_FRAMES = 360
-"""Maximum number of photographs. Cameras and prior are learned from all of them, because photographs cannot be interpolated; the time grows
-with the third power of their number."""
+"""Maximum number of photographs. Cameras and prior are learned from all of them, because photographs cannot be interpolated."""
 
 
 def resolved_order(tracks: Tracks, settings: Settings) -> tuple[Settings, str]:
