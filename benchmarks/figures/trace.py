@@ -19,12 +19,14 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from xml.sax.saxutils import escape
 
 import httpx
 from pliant.client import Client
 from pliant.solver.gallery import face
+from pliant.worker.processes.containment import die_with_parent
 from pliant.worker.processes.valkey import attended
 from pliant.worker.settings import Settings
 
@@ -68,7 +70,11 @@ def installation(folder: Path) -> Iterator[str]:
     with attended(settings), ExitStack() as started:
         for name, module in (("api", ["pliant.service"]), ("worker", ["pliant.worker", "work"])):
             with (folder / f"{name}.spans").open("wb") as out, (folder / f"{name}.log").open("wb") as log:
-                process = subprocess.Popen([sys.executable, "-m", *module], env=env, stdout=out, stderr=log)
+                process = subprocess.Popen(
+                    [sys.executable, "-m", *module], env=env, stdout=out, stderr=log,
+                    # An interruption may come before the next line.
+                    preexec_fn=partial(die_with_parent, os.getpid(), how=signal.SIGTERM),
+                )  # fmt: skip
             started.enter_context(process)  # waits for its end
             started.callback(process.terminate)
         until = time.monotonic() + 60

@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import httpx
@@ -26,6 +27,7 @@ from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
+from pliant.worker.processes.containment import die_with_parent
 from pliant.worker.processes.valkey import Valkey
 from pliant.worker.settings import Settings
 
@@ -68,7 +70,11 @@ def service(data: Path, blobs: int | None) -> Iterator[str]:
             "PLIANT_BLOB_URL": "s3://bucket/prefix", "AWS_ENDPOINT_URL": f"http://127.0.0.1:{blobs}", "AWS_ALLOW_HTTP": "true",
             "AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b", "AWS_REGION": "us-east-1",
         }  # fmt: skip
-    process = subprocess.Popen([sys.executable, "-m", "pliant.service"], env=env)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pliant.service"], env=env,
+        # An interruption may come before the process is held below.
+        preexec_fn=partial(die_with_parent, os.getpid(), how=signal.SIGTERM),
+    )  # fmt: skip
     url = f"http://127.0.0.1:{port}"
     try:
         while True:
