@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from pliant.solver.descent import OVERHEAD, expected_iterations, expected_reweightings
-from pliant.solver.limits import LEARNED_FRAMES, learned_frames
+from pliant.solver.limits import learned_frames
 from pliant.solver.records import Floats
 
 UNIT_SECONDS, FRAME_SECONDS = 7e-5, 1.3e-5
@@ -62,13 +62,13 @@ GRAM_SECONDS = 1e-9
 
 UNITS = {
     "multistart": (1600, 120, 1.3),
-    "model_order": (1000, LEARNED_FRAMES, 0.6),
+    "model_order": (1000, 360, 0.6),
     "starts": (2140, 40, 0.85),
-    "perspective": (10, LEARNED_FRAMES, 30.0),
+    "perspective": (10, 360, 30.0),
     "scales": (820, 120, 0.85),
-    "refinement": (1500, LEARNED_FRAMES, 1.1),
-    "observations": (184, LEARNED_FRAMES, 6.0),
-    "covariance": (380, LEARNED_FRAMES, 1.0),
+    "refinement": (1500, 360, 1.1),
+    "observations": (184, 360, 6.0),
+    "covariance": (380, 360, 1.0),
     "extension": (80, 1_000_000, 3.0),
     "trust": (10, 100, 60.0),
 }
@@ -108,6 +108,7 @@ def planned(
     known_cameras: bool,
     sheet: bool,
     known_scales: bool = False,
+    ordered: bool = True,
     unseen: float = 0.0,
 ) -> tuple[Stage, ...]:
     """Return the expected stages of a solve, in order.
@@ -124,6 +125,8 @@ def planned(
         Whether rotations are given.
     known_scales : bool
         Whether scales are given with the rotations.
+    ordered : bool
+        True for a film, False for photographs in no order.
     sheet : bool
         Whether the tracks are tested for an isometric surface.
     unseen : float
@@ -137,9 +140,10 @@ def planned(
     first = [Stage("surface", SURFACE_SECONDS * min(frames, 24), 280, setup=SURFACE_SETUP)] if sheet else []
     most_frames, most_points = MOST_COMPLETED
     filled = COMPLETION_SECONDS * frames * min(frames, most_frames) * min(points, most_points) if unseen > 0 else 0.0
-    filled += GRAM_SECONDS * learned_frames(frames) ** 2 * points
+    used = learned_frames(frames) if ordered else frames
+    filled += GRAM_SECONDS * used**2 * points
     first.append(Stage("completion", 0.1 + filled, 6, growth=RANK_GROWTH))
-    learned = learning(frames, gaussian=gaussian, known_cameras=known_cameras, known_scales=known_scales)
+    learned = learning(frames, used, gaussian=gaussian, known_cameras=known_cameras, known_scales=known_scales)
     return (*first, *learned, start, shapes, *last)
 
 
@@ -158,16 +162,18 @@ def unseen_frames(visible: Floats) -> float:
     return float(longest.mean())
 
 
-def learning(frames: int, *, gaussian: bool, known_cameras: bool, known_scales: bool = False) -> tuple[Stage, ...]:
-    """Return the stages of cameras and prior; hidden entries and outliers add others later (`Monitor.expect`)."""
+def learning(
+    frames: int, used: int, *, gaussian: bool, known_cameras: bool, known_scales: bool = False
+) -> tuple[Stage, ...]:
+    """Return the stages of cameras and prior, learned from `used` of the frames; `Monitor.expect` later adds those of hidden entries."""
     names = ["multistart", "model_order", "starts", "perspective", "scales", "refinement", "covariance"]
     if known_cameras:
         names = ["model_order", *([] if known_scales else ["scales"]), "covariance"] if gaussian else []
     elif not gaussian:
         names = ["multistart"]
-    if gaussian and frames > LEARNED_FRAMES:
-        names.append("extension")
-    stages = tuple(stage_of(name, frames) for name in names)
+    stages = [stage_of(name, used) for name in names]
+    if gaussian and used < frames:
+        stages.append(stage_of("extension", frames))
     return tuple(_longer(stage) if known_cameras and stage.name == "scales" else stage for stage in stages)
 
 
@@ -179,7 +185,7 @@ def _longer(scales: Stage) -> Stage:
 def stage_of(name: str, frames: int) -> Stage:
     """Return the stage `name` of `UNITS` for a number of frames."""
     units, most_frames, cost = UNITS[name]
-    used = min(frames if name == "extension" else learned_frames(frames), most_frames)
+    used = min(frames, most_frames)
     curved = 1 + used / CUBIC_FRAMES[name] if name in CUBIC_FRAMES else 1.0
     return Stage(name, units * cost * curved * (UNIT_SECONDS + FRAME_SECONDS * used), units)
 

@@ -432,3 +432,15 @@ def test_the_gram_matrix_of_many_points_polls_for_a_stop() -> None:
     few = []
     complete(normalize(Tracks.from_arrays(points[:, :1000])), seed=0, should_stop=lambda: bool(few.append(1)))
     assert len(asked) >= len(few) + 2
+
+
+def test_the_plan_of_a_long_film_has_fewer_learned_frames_and_an_extension() -> None:
+    film, photographs = (
+        {
+            stage.name: stage.seconds
+            for stage in planned(300, 100, gaussian=True, known_cameras=False, sheet=False, ordered=ordered)
+        }
+        for ordered in (True, False)
+    )
+    assert film.keys() - photographs.keys() == {"extension"}
+    assert film["refinement"] < 0.6 * photographs["refinement"]

@@ -71,7 +71,8 @@ def estimated(num_frames: int, num_points: int, options: Options, *, has_rotatio
     observations = num_frames * num_points
     learns = options.prior == "gaussian" and options.method == "robust" and options.preset == "auto"
     at_once = int(min(observations, _largest_block(options)))
-    learning = LEARNING[learns, has_rotations] * learned_frames(num_frames)
+    used = num_frames if options.order == "any" else learned_frames(num_frames)
+    learning = LEARNING[learns, has_rotations] * used
     if learns and _may_be_perspective(options):
         learning *= LENS
     return Estimate(

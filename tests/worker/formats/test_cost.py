@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from pliant.schemas.options import Options
 from pliant.solver.limits import BLOCK_OBSERVATIONS
-from pliant.worker.formats.cost import BEYOND, BYTES, LIBRARIES, estimated, largest_that_fits
+from pliant.worker.formats.cost import BEYOND, BYTES, LEARNING, LIBRARIES, SECONDS, estimated, largest_that_fits
 
 
 @pytest.mark.parametrize("prior", ["gaussian", "smooth", "smooth+low_rank"])
@@ -23,3 +23,9 @@ def test_large_jobs_need_less_memory_per_additional_observation() -> None:
     large = estimated(100, 1_000_000, Options()).memory_bytes
     assert large == LIBRARIES + BYTES["gaussian"] * BLOCK_OBSERVATIONS + BEYOND * (100_000_000 - BLOCK_OBSERVATIONS)
     assert estimated(100, 1_000_000, Options(prior="smooth+low_rank")).memory_bytes > large
+
+
+def test_films_are_learned_from_every_nth_frame_and_photographs_from_all() -> None:
+    film, photographs = (estimated(300, 1, Options(order=order)).seconds for order in ("film", "any"))
+    assert film == estimated(150, 1, Options(order="film")).seconds
+    assert photographs == pytest.approx(SECONDS + 300 * LEARNING[True, False], abs=0.1)

@@ -14,12 +14,6 @@ export class Clock {
     return this.times[this.times.length - 1] ?? 0;
   }
 
-  /** Seconds for which the sequence is shown; its last frame lasts as long as the others on average. */
-  get duration(): number {
-    const count = this.times.length;
-    return count > 1 ? (this.last * count) / (count - 1) : 0;
-  }
-
   /** Return the seconds at a time in frames, 0 … frames − 1. */
   seconds(frame: number): number {
     const before = Math.min(Math.floor(frame), this.times.length - 1);

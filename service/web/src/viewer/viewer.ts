@@ -170,7 +170,7 @@ export class Viewer {
       preview: sources.preview,
       film: this.film ? sources.film : undefined,
       usdz: sources.usdz,
-      seconds: preview.clock.duration,
+      seconds: preview.clock.last,
       background: () => getComputedStyle(this.view).getPropertyValue("--back-1").trim(),
       canvases: () => this.canvases(),
       pose: (share, kind) => this.pose(share, kind),
