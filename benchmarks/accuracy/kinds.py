@@ -182,6 +182,7 @@ def measured(kind: str, path: str, distance: float, noise: float) -> dict[str, A
         "focal_error": None if focal is None or not np.isfinite(distance) else abs(focal / (HALF_SIZE * distance) - 1),
         "verdict": None if found.trust is None else found.trust.verdict.value,
         "expected_error": None if found.trust is None else found.trust.expected_error,
+        "interval": None if found.trust is None else found.trust.interval,
         "surface": found.choices.reasons.get("surface", ""), "seconds": time.perf_counter() - began,
     }  # fmt: skip
 
@@ -202,6 +203,20 @@ def table(found: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def of_intervals(found: list[dict[str, Any]]) -> str:
+    """Return a sentence on how many errors lie in the intervals that the solver states, without those for which it states none."""
+    places = [
+        (row["interval"][0] <= row["e3d_frame_scaled"], row["e3d_frame_scaled"] <= row["interval"][1])
+        for row in found
+        if row["interval"] is not None
+    ]
+    inside, above = sum(all(place) for place in places), sum(not below for _, below in places)
+    return (
+        f"The interval contains the error in {inside} of {len(places)} solves; in {above} the error is larger. "
+        f"Solves without an interval: {len(found) - len(places)}."
+    )
+
+
 def _short(value: float) -> str:
     return f"{value:.3f}".removeprefix("0")
 
@@ -214,7 +229,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--table", action="store_true", help="print the table of the results file")
     given = parser.parse_args(arguments)
     if given.table:
-        print(table(rows(given.out)))
+        print(table(rows(given.out)), of_intervals(rows(given.out)), sep="\n\n")
         return
     done = {(row["kind"], row["path"], row["distance"], row["noise"]) for row in rows(given.out)}
     for kind in KINDS:

@@ -52,7 +52,7 @@ def test_measurements_are_resumed_and_tabulated(
         shown = distance if np.isfinite(distance) else None
         return {
             "kind": kind, "path": path, "distance": shown, "noise": noise, "e3d_frame_scaled": 0.0124, "flat": 0.3,
-            "rigid": 0.2, "verdict": "good", "seconds": 1.0,
+            "rigid": 0.2, "verdict": "good", "seconds": 1.0, "interval": None if distance == np.inf else [0.01, 0.02],
         }  # fmt: skip
 
     monkeypatch.setattr(kinds, "measured", measured)
@@ -65,7 +65,16 @@ def test_measurements_are_resumed_and_tabulated(
     assert capsys.readouterr().out.splitlines()[2:] == [
         "| arm | 4 |  |  |  |  | .012 (.200) |  |",
         "| arm | ∞ |  |  |  |  | .012 (.200) |  |",
+        "",
+        "The interval contains the error in 1 of 1 solves; in 0 the error is larger. Solves without an interval: 1.",
     ]
+
+
+def test_errors_below_inside_and_above_their_intervals_are_counted() -> None:
+    found = [{"e3d_frame_scaled": error, "interval": [0.1, 0.2]} for error in (0.05, 0.1, 0.15, 0.2, 0.21, 0.3)]
+    assert kinds.of_intervals([*found, {"e3d_frame_scaled": 0.5, "interval": None}]) == (
+        "The interval contains the error in 3 of 6 solves; in 2 the error is larger. Solves without an interval: 1."
+    )
 
 
 @pytest.mark.slow
