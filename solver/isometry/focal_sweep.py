@@ -184,7 +184,7 @@ def _carried(depths: Floats, seen: NDArray[np.bool_], ratio: float) -> Floats:
 
 
 def judged(tried: list[Tried], least: Tried) -> tuple[bool, str]:
-    """Return whether I is small and clearly smaller than at the neighbouring focal lengths, and a sentence for the report."""
+    """Return whether I is small and clearly smaller than at the neighbouring focal lengths, with a sentence; else a clause why not."""
     value = least.found.inconsistency
     sides = [
         min((t.found.inconsistency for t in tried if (t.focal - least.focal) * side > 0
@@ -193,9 +193,9 @@ def judged(tried: list[Tried], least: Tried) -> tuple[bool, str]:
     ]  # fmt: skip
     ratio = min(sides) / value if value > 0 else np.inf
     if value > MAX_INCONSISTENCY:
-        return False, f"Not an isometric sheet: edge lengths change by {value:.1%} or more, whatever the focal length."
+        return False, f"its edge lengths change by {value:.1%} or more, whatever the focal length"
     if not (ratio >= CLEAR and min(sides) - value >= RISE and _single(tried, least)):
-        return False, "Rejected as an isometric sheet: its edge lengths do not single out a focal length."
+        return False, "its edge lengths do not single out a focal length"
     return True, (
         f"Taken as an isometric sheet: at a focal length of {least.focal:.0f} px edge lengths change by {value:.2%}, "
         f"{ratio:.1f} times as much at neighbouring focal lengths."

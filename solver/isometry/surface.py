@@ -165,7 +165,10 @@ def isometric_surface(
     if clear:
         clear, why = _confirmed(search, chosen, why)
     if not clear and not required:
-        return IsometricVerdict(why, _trace(tried))
+        advice = "If it is one that keeps its lengths, such as paper or cloth, set surface=isometric."
+        return IsometricVerdict(f"Rejected as an isometric sheet: {why}. {advice}", _trace(tried))
+    if not clear:
+        why = f"Solved as an isometric sheet, as set, although {why}."
     surface = _everywhere(search, tracks, seen, chosen)
     if surface is None:
         return IsometricVerdict("No isometric surface was found: its points are not connected.", _trace(tried))
@@ -204,11 +207,11 @@ def _implausible(search: FocalSearch | None, focal: float, required: bool) -> st
 
 
 def _confirmed(search: FocalSearch, chosen: Tried, why: str) -> tuple[bool, str]:
-    """Return whether halves of the frames lead to the same edge lengths, and a sentence for the report."""
+    """Return whether halves of the frames lead to the same edge lengths, with a sentence; else a clause why not."""
     share = disagreement(search, chosen)
     if share > DISAGREEMENT:
         change = "by more than their length" if share > 1 else f"by {share:.0%}"
-        return False, f"Rejected as an isometric sheet: its edge lengths differ {change} between halves of the frames."
+        return False, f"its edge lengths differ {change} between halves of the frames"
     return True, f"{why} Halves of the frames agree on the lengths to within {share:.1%}."
 
 

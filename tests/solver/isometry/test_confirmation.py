@@ -47,9 +47,12 @@ def test_a_surface_that_the_halves_do_not_confirm_is_rejected(monkeypatch: pytes
     monkeypatch.setattr(surface, "disagreement", lambda search, chosen: 0.4)
     refused = isometric_surface(tracks, focal=FOCAL, image_size=SIZE)
     assert refused.surface is None
-    assert "differ by 40%" in refused.reason
+    why = "its edge lengths differ by 40% between halves of the frames"
+    advice = "If it is one that keeps its lengths, such as paper or cloth, set surface=isometric."
+    assert refused.reason == f"Rejected as an isometric sheet: {why}. {advice}"
     required = isometric_surface(tracks, focal=FOCAL, image_size=SIZE, required=True)
     assert required.surface is not None
+    assert required.reason == f"Solved as an isometric sheet, as set, although {why}."
     assert any("hardly support" in warning for warning in required.warnings)
 
 
