@@ -1,11 +1,12 @@
 """Error on kinds of objects and camera paths that constants were not chosen on: six kinds, six paths, near the camera and orthographic.
 
-    python -m benchmarks.accuracy.kinds [--only NAME] [--distances 4,inf] [--noise PIXELS] [--out FILE]
+    python -m benchmarks.accuracy.kinds [--only NAME] [--distances 4,inf] [--noise PIXELS] [--surface isometric] [--out FILE]
     python -m benchmarks.accuracy.kinds --table [--out FILE]
 
 Tracks of 60 frames and 144 points (stick figure: 41), without a mesh, in a picture of 1280 × 720 px with a half-size of 300 px. The
 distance of the pinhole camera is in half-sizes. Default settings with `image_size`; the focal length is not given. Each row also has the
 errors of the true images with no depth (`flat`) and of the mean true shape in every frame (`rigid`). Finished ones are not repeated.
+`--surface isometric` sets that option, as someone would who knows that the object is a sheet; the table has these rows of their own.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from pliant.solver import Settings, Tracks, solve
 from pliant.solver.evaluation.metrics import e3d_frame_scaled
 from pliant.solver.model.so3 import exponential
+from pliant.solver.settings import Surface
 
 from benchmarks.rows import append_row, parser_of, rows
 
@@ -167,15 +169,15 @@ def sequence(kind: str, path: str, distance: float, noise: float) -> tuple[Track
     return Tracks.from_arrays(images + noise * random.normal(size=images.shape)), seen
 
 
-def measured(kind: str, path: str, distance: float, noise: float) -> dict[str, Any]:
-    """Solve one sequence and return its row."""
+def measured(kind: str, path: str, distance: float, noise: float, surface: Surface = "auto") -> dict[str, Any]:
+    """Solve one sequence with the option `surface` and return its row."""
     tracks, truth = sequence(kind, path, distance, noise)
     began = time.perf_counter()
-    found = solve(tracks, settings=Settings(image_size=PICTURE))
+    found = solve(tracks, settings=Settings(image_size=PICTURE, surface=surface))
     rigid = KINDS[kind](np.random.default_rng(5)).mean(axis=0)
     focal = found.camera.focal
     return {
-        "kind": kind, "path": path, "distance": distance if np.isfinite(distance) else None, "noise": noise,
+        "kind": kind, "path": path, "option": surface, "distance": distance if np.isfinite(distance) else None, "noise": noise,
         "e3d_frame_scaled": e3d_frame_scaled(found.shapes, truth),
         "flat": e3d_frame_scaled(truth * [1, 1, 0], truth),
         "rigid": e3d_frame_scaled(np.broadcast_to(rigid, truth.shape), truth),
@@ -188,18 +190,19 @@ def measured(kind: str, path: str, distance: float, noise: float) -> dict[str, A
 
 
 def table(found: list[dict[str, Any]]) -> str:
-    """Return Markdown: one row per kind and distance, one column per path; errors, in brackets the better of `flat` and `rigid`."""
+    """Return Markdown: one row per kind, option and distance, one column per path; errors, in brackets the better of `flat` and `rigid`."""
     lines = ["| kind | d | " + " | ".join(PATHS) + " |", "|---" * (2 + len(PATHS)) + "|"]
-    by_place = {(row["kind"], row["distance"], row["path"]): row for row in found}
-    for kind, distance in sorted(
-        {key[:2] for key in by_place}, key=lambda key: (list(KINDS).index(key[0]), key[1] or np.inf)
+    by_place = {(row["kind"], row["option"], row["distance"], row["path"]): row for row in found}
+    for kind, option, distance in sorted(
+        {key[:3] for key in by_place}, key=lambda key: (list(KINDS).index(key[0]), key[1], key[2] or np.inf)
     ):
-        cells = [by_place.get((kind, distance, path)) for path in PATHS]
+        cells = [by_place.get((kind, option, distance, path)) for path in PATHS]
         texts = [
             "" if cell is None else f"{_short(cell['e3d_frame_scaled'])} ({_short(min(cell['flat'], cell['rigid']))})"
             for cell in cells
         ]
-        lines.append(f"| {kind} | {'∞' if distance is None else f'{distance:g}'} | " + " | ".join(texts) + " |")
+        name = kind if option == "auto" else f"{kind}, `surface={option}`"
+        lines.append(f"| {name} | {'∞' if distance is None else f'{distance:g}'} | " + " | ".join(texts) + " |")
     return "\n".join(lines)
 
 
@@ -225,21 +228,23 @@ def main(arguments: list[str] | None = None) -> None:
     """Measure what is missing, or print the table."""
     parser = parser_of(__doc__, out=Path("benchmarks/results/kinds.jsonl"))
     parser.add_argument("--distances", default="4,inf", help="half-sizes, comma-separated")
+    parser.add_argument("--surface", default="auto", choices=("auto", "isometric", "free"), help="option of the solver")
     parser.add_argument("--noise", type=float, default=NOISE, help="standard deviation, px")
     parser.add_argument("--table", action="store_true", help="print the table of the results file")
     given = parser.parse_args(arguments)
     if given.table:
-        print(table(rows(given.out)), of_intervals(rows(given.out)), sep="\n\n")
+        found = rows(given.out)
+        print(table(found), of_intervals([row for row in found if row["option"] == "auto"]), sep="\n\n")
         return
-    done = {(row["kind"], row["path"], row["distance"], row["noise"]) for row in rows(given.out)}
+    done = {(row["kind"], row["path"], row["distance"], row["noise"], row["option"]) for row in rows(given.out)}
     for kind in KINDS:
         for path in PATHS:
             if given.only and not any(word in f"{kind} {path}" for word in given.only):
                 continue
             for distance in (float(each) for each in given.distances.split(",")):
-                if (kind, path, distance if np.isfinite(distance) else None, given.noise) in done:
+                if (kind, path, distance if np.isfinite(distance) else None, given.noise, given.surface) in done:
                     continue
-                row = measured(kind, path, distance, given.noise)
+                row = measured(kind, path, distance, given.noise, given.surface)
                 append_row(given.out, row)
                 print(
                     f"{kind:10} {path:11} d = {distance:<4g} {row['e3d_frame_scaled']:.4f} "

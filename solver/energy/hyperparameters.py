@@ -101,7 +101,10 @@ def without_effect(settings: Settings, *, with_mesh: bool) -> tuple[str, ...]:
         sentences.append("temporal_order has no effect with prior gaussian; set prior to smooth or smooth+low_rank.")
     if settings.precision == "float32" and settings.gaussian:
         sentences.append("precision has no effect with prior gaussian, which needs float64.")
-    for name, given in (("laplacian", settings.laplacian != "auto"), ("spatial_weight", settings.spatial_weight is not None)):
+    for name, given in (
+        ("laplacian", settings.laplacian != "auto"),
+        ("spatial_weight", settings.spatial_weight is not None),
+    ):
         if given and not with_mesh:
             sentences.append(f"{name} has no effect without a mesh.")
     return tuple(sentences)

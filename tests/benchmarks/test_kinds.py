@@ -45,13 +45,13 @@ def test_images_are_those_of_a_pinhole_camera(path: str) -> None:
 def test_measurements_are_resumed_and_tabulated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    asked: list[tuple[str, str, float]] = []
+    asked: list[tuple[str, str, float, str]] = []
 
-    def measured(kind: str, path: str, distance: float, noise: float) -> dict[str, object]:
-        asked.append((kind, path, distance))
+    def measured(kind: str, path: str, distance: float, noise: float, surface: str) -> dict[str, object]:
+        asked.append((kind, path, distance, surface))
         shown = distance if np.isfinite(distance) else None
         return {
-            "kind": kind, "path": path, "distance": shown, "noise": noise, "e3d_frame_scaled": 0.0124, "flat": 0.3,
+            "kind": kind, "path": path, "option": surface, "distance": shown, "noise": noise, "e3d_frame_scaled": 0.0124, "flat": 0.3,
             "rigid": 0.2, "verdict": "good", "seconds": 1.0, "interval": None if distance == np.inf else [0.01, 0.02],
         }  # fmt: skip
 
@@ -59,12 +59,14 @@ def test_measurements_are_resumed_and_tabulated(
     out = ["--out", str(tmp_path / "kinds.jsonl")]
     kinds.main(["--only", "arm line", *out])
     kinds.main(["--only", "arm line", *out])
-    assert asked == [("arm", "line", 4.0), ("arm", "line", np.inf)]
+    kinds.main(["--only", "arm line", "--surface", "isometric", "--distances", "4", *out])
+    assert asked == [("arm", "line", 4.0, "auto"), ("arm", "line", np.inf, "auto"), ("arm", "line", 4.0, "isometric")]
     capsys.readouterr()
     kinds.main(["--table", *out])
     assert capsys.readouterr().out.splitlines()[2:] == [
         "| arm | 4 |  |  |  |  | .012 (.200) |  |",
         "| arm | ∞ |  |  |  |  | .012 (.200) |  |",
+        "| arm, `surface=isometric` | 4 |  |  |  |  | .012 (.200) |  |",
         "",
         "The interval contains the error in 1 of 1 solves; in 0 the error is larger. Solves without an interval: 1.",
     ]
@@ -84,3 +86,15 @@ def test_strong_deformation_near_the_camera_needs_the_second_start(tmp_path: Pat
     assert row["focal_error"] < 0.1
     append_row(tmp_path / "kinds.jsonl", row)
     assert "| tearing | 4 |" in kinds.table(rows(tmp_path / "kinds.jsonl"))
+
+
+@pytest.mark.slow
+def test_near_paper_whose_focal_length_is_ambiguous_needs_the_option() -> None:
+    auto, asked = (kinds.measured("paper", "line", 4.0, 0.3, each) for each in ("auto", "isometric"))
+    assert auto["surface"].startswith("Rejected as an isometric sheet: its edge lengths do not single out")
+    assert "set surface=isometric" in auto["surface"]
+    assert asked["surface"].startswith(
+        "Solved as an isometric sheet, as set, although its edge lengths do not single out"
+    )
+    assert asked["e3d_frame_scaled"] < 0.1 * auto["e3d_frame_scaled"]
+    assert (auto["verdict"], asked["verdict"]) == ("with_care", "with_care")
