@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import struct
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from pliant.schemas.outputs import OutputRequest
 from pliant.worker.errors import Conflict, NotAllowedNow, QuotaExceeded, TooManyQueued, UnknownJob
 from pliant.worker.execution.attempt import Attempt, work
 from pliant.worker.execution.further_outputs import read_solution, write_further
-from pliant.worker.formats import InvalidInput
+from pliant.worker.formats import InvalidInput, save_inputs
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.further_outputs import make_outputs
 from pliant.worker.jobs.retry import retry
@@ -56,6 +57,19 @@ def test_further_outputs_equal_those_of_the_solving_job(jobs: Jobs, solved: Job,
     ours, theirs = ({each.name: each.sha256 for each in job.artifacts} for job in (done, solved))
     assert ours["shapes_ply.zip"] == theirs["shapes_ply.zip"]
     assert findings(jobs, pause=0) == []
+
+
+def test_further_outputs_follow_the_uneven_times_of_a_film(jobs: Jobs, tmp_path: Path) -> None:
+    times = np.array([5.0, 5.1, 5.2, 6.5])
+    inputs = make_inputs(tmp_path / "even.npz", frames=4, points=30)
+    save_inputs(dataclasses.replace(inputs, frame_times=times), tmp_path / "in.npz")
+    options = OPTIONS.model_copy(update={"fps": 2.0})  # the mean rate: 3 frames in 1.5 s
+    solved = jobs.submit(tmp_path / "in.npz", Submission(options=options), interpretation=inputs.interpretation)
+    assert run(jobs, solved, tmp_path / "solving").status is Status.SUCCEEDED
+    more, _ = make_outputs(jobs, solved.id, OutputRequest(outputs=("mdd",)))
+    assert run(jobs, more, tmp_path / "w").status is Status.SUCCEEDED
+    written = b"".join(jobs.blobs.get(f"{jobs.stored(more.id).prefix}shapes.mdd").read())
+    np.testing.assert_allclose(struct.unpack_from(">4f", written, 8), times - times[0], rtol=1e-6)
 
 
 def test_further_outputs_survive_deletion_of_the_solved_job(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
