@@ -165,8 +165,9 @@ def isometric_surface(
     if clear:
         clear, why = _confirmed(search, chosen, why)
     if not clear and not required:
-        advice = "If it is one that keeps its lengths, such as paper or cloth, set surface=isometric."
+        advice = "If it is one that keeps its lengths, such as paper or cloth seen from nearby, try surface=isometric and compare."
         return IsometricVerdict(f"Rejected as an isometric sheet: {why}. {advice}", _trace(tried))
+    warnings = _warnings(None if clear else why, focal, least, chosen)
     if not clear:
         why = f"Solved as an isometric sheet, as set, although {why}."
     surface = _everywhere(search, tracks, seen, chosen)
@@ -174,7 +175,7 @@ def isometric_surface(
         return IsometricVerdict("No isometric surface was found: its points are not connected.", _trace(tried))
     if not required and (rigid := _rigid(search, surface)) is not None:
         return IsometricVerdict(rigid, _trace(tried))
-    return IsometricVerdict(why, _trace(tried), surface, _warnings(clear, focal, least, chosen))
+    return IsometricVerdict(why, _trace(tried), surface, warnings)
 
 
 def sheetlike(tracks: Tracks) -> float | None:
@@ -336,12 +337,12 @@ def _diagonal(tracks: Tracks, image_size: tuple[float, float] | None) -> float:
     return DIAGONAL_MARGIN * float(np.hypot(*(high - low)))
 
 
-def _warnings(clear: bool, focal: float | None, least: Tried, chosen: Tried) -> tuple[str, ...]:
+def _warnings(doubt: str | None, focal: float | None, least: Tried, chosen: Tried) -> tuple[str, ...]:
+    """Return the warnings for a surface that is taken; `doubt` is a clause that says why it would not be taken if it were not required."""
     warnings = []
-    if not clear:
+    if doubt is not None:
         warnings.append(
-            f"The surface was required to be isometric, but the tracks hardly support it: edge lengths change by "
-            f"{chosen.found.inconsistency:.1%}. Compare with surface=free."
+            f"The surface was required to be isometric, but the tracks hardly support it: {doubt}. Compare with surface=free."
         )
     if focal is not None and chosen.found.inconsistency > CLEAR * least.found.inconsistency:
         warnings.append(

@@ -68,14 +68,29 @@ def test_measurements_are_resumed_and_tabulated(
         "| arm | ∞ |  |  |  |  | .012 (.200) |  |",
         "| arm, `surface=isometric` | 4 |  |  |  |  | .012 (.200) |  |",
         "",
-        "The interval contains the error in 1 of 1 solves; in 0 the error is larger. Solves without an interval: 1.",
+        "With default settings, the interval contains the error in 1 of 1 solves, and in 1 of 1 with the verdict good; in 0 the error "
+        "is larger. Solves without an interval: 1. By kind: arm 1 of 1.",
     ]
 
 
 def test_errors_below_inside_and_above_their_intervals_are_counted() -> None:
-    found = [{"e3d_frame_scaled": error, "interval": [0.1, 0.2]} for error in (0.05, 0.1, 0.15, 0.2, 0.21, 0.3)]
-    assert kinds.of_intervals([*found, {"e3d_frame_scaled": 0.5, "interval": None}]) == (
-        "The interval contains the error in 3 of 6 solves; in 2 the error is larger. Solves without an interval: 1."
+    errors = (0.05, 0.1, 0.15, 0.2, 0.21, 0.3)
+    found: list[dict[str, object]] = [
+        {"kind": kind, "option": "auto", "verdict": verdict, "e3d_frame_scaled": error, "interval": [0.1, 0.2]}
+        for error, kind, verdict in zip(
+            errors,
+            ("arm", "arm", "arm", "paper", "paper", "paper"),
+            ("good", "good", "with_care", "with_care", "good", "with_care"),
+            strict=True,
+        )
+    ]
+    found.append({"kind": "arm", "option": "auto", "verdict": "good", "e3d_frame_scaled": 0.5, "interval": None})
+    found.append(
+        {"kind": "paper", "option": "isometric", "verdict": "good", "e3d_frame_scaled": 0.15, "interval": [0.1, 0.2]}
+    )
+    assert kinds.of_intervals(found) == (
+        "With default settings, the interval contains the error in 3 of 6 solves, and in 1 of 3 with the verdict good; "
+        "in 2 the error is larger. Solves without an interval: 1. By kind: arm 2 of 3, paper 1 of 3."
     )
 
 
@@ -92,7 +107,7 @@ def test_strong_deformation_near_the_camera_needs_the_second_start(tmp_path: Pat
 def test_near_paper_whose_focal_length_is_ambiguous_needs_the_option() -> None:
     auto, asked = (kinds.measured("paper", "line", 4.0, 0.3, each) for each in ("auto", "isometric"))
     assert auto["surface"].startswith("Rejected as an isometric sheet: its edge lengths do not single out")
-    assert "set surface=isometric" in auto["surface"]
+    assert "try surface=isometric" in auto["surface"]
     assert asked["surface"].startswith(
         "Solved as an isometric sheet, as set, although its edge lengths do not single out"
     )

@@ -56,7 +56,9 @@ def test_the_verdict_is_above_the_viewer_and_in_the_list(
     box = page.get_by_role("region", name="Verdict")
     expect(box).to_contain_text(words)
     expect(box).to_contain_text(TRUST)
-    expect(box).to_contain_text("Likely range of the true error: 2.0 % to 5.1 % (correct in three of four")
+    expect(box).to_contain_text(
+        "Likely range of the true error: 2.0 % to 5.1 % (correct in three of four test sequences; the error can be"
+    )
     figures = {
         "Turn between the most different views": "63°",
         "Turn per frame (median)": "2.1°",

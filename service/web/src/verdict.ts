@@ -81,7 +81,7 @@ export class VerdictBox {
     const interval = report["expected_error_interval"];
     const [low, high] = Array.isArray(interval) ? interval.map(Number) : [];
     const words =
-      low === undefined || high === undefined ? "" : `Likely range of the true error: ${percent(low)} to ${percent(high)} (correct in three of four test sequences; the error can be larger where the object deforms strongly).`;
+      low === undefined || high === undefined ? "" : `Likely range of the true error: ${percent(low)} to ${percent(high)} (correct in three of four test sequences; the error can be larger where a motion of the camera would explain the deformation as well).`;
     fill(this.interval, words, () => [words]);
     const rows = evidenceOf(report);
     this.figures.hidden = rows.length === 0;

@@ -48,7 +48,7 @@ def test_a_surface_that_the_halves_do_not_confirm_is_rejected(monkeypatch: pytes
     refused = isometric_surface(tracks, focal=FOCAL, image_size=SIZE)
     assert refused.surface is None
     why = "its edge lengths differ by 40% between halves of the frames"
-    advice = "If it is one that keeps its lengths, such as paper or cloth, set surface=isometric."
+    advice = "If it is one that keeps its lengths, such as paper or cloth seen from nearby, try surface=isometric and compare."
     assert refused.reason == f"Rejected as an isometric sheet: {why}. {advice}"
     required = isometric_surface(tracks, focal=FOCAL, image_size=SIZE, required=True)
     assert required.surface is not None

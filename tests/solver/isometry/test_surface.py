@@ -132,7 +132,15 @@ def test_no_minimum_is_refined_that_would_not_be_accepted(monkeypatch: pytest.Mo
     tried = focal_sweep.sweep(SEARCH, 2.0 * DIAGONAL, DIAGONAL, given=False)
     steps = np.log(np.array(focals) / focals[0]) / np.log(focal_sweep.FOCAL_STEP)
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
-    assert not focal_sweep.judged(tried, focal_sweep.least_of(tried))[0]
+    verdict = focal_sweep.judged(tried, focal_sweep.least_of(tried))
+    assert verdict == (False, "its edge lengths do not single out a focal length")
+
+
+def test_lengths_that_change_at_every_focal_length_are_not_those_of_a_sheet(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_inconsistencies(monkeypatch, lambda focal: 0.05 + 0.02 * float(np.log(focal / 500)) ** 2)
+    tried = focal_sweep.sweep(SEARCH, 500.0, DIAGONAL, given=True)
+    verdict = focal_sweep.judged(tried, focal_sweep.least_of(tried))
+    assert verdict == (False, "its edge lengths change by 5.0% or more, whatever the focal length")
 
 
 def test_refinement_recovers_the_true_depths_of_a_rigid_plane() -> None:
