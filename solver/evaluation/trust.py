@@ -77,8 +77,8 @@ class Trust:
     interval: tuple[float, float] | None
     """Interval that contains the true error in three of four solves of `benchmarks.trust`.
 
-    Where a motion of the camera would explain the deformation as well, the error can be larger: of `benchmarks.accuracy.kinds` it contains
-    fewer than half. None without a posterior or where the model is doubtful.
+    Where a motion of the camera would explain the deformation as well, the error can be larger: the interval contains
+    fewer than half of those in `benchmarks.accuracy.kinds`. None without a posterior or where the model is doubtful.
     """
 
     turn_degrees: float
