@@ -305,11 +305,13 @@ def check_blobs() -> Iterator[Finding]:
     url = settings_here().blob_url
     if url is None:
         return
-    from pliant.worker.errors import StoreUnavailable
+    from pliant.worker.errors import InvalidSetting, StoreUnavailable
     from pliant.worker.store.blobs import Blobs
 
     try:
         Blobs.open(url).check()
+    except InvalidSetting as fault:
+        yield Finding("blobs", "bad", str(fault), "Correct the address.")
     except StoreUnavailable as fault:
         advice = "Check the address, the bucket and the AWS_ variables; the store's own message is above."
         yield Finding("blobs", "bad", f"{url} cannot be used ({fault.reason})", advice)
@@ -322,7 +324,11 @@ def _redis(address: str) -> Finding:
     from urllib.parse import urlsplit
 
     parts = urlsplit(address)
-    where = f"{parts.scheme}://{parts.hostname or parts.path}:{parts.port or 6379}"
+    where = (
+        f"{parts.scheme}://{parts.hostname}:{parts.port or 6379}"
+        if parts.hostname
+        else f"{parts.scheme}://{parts.path}"
+    )
     advice = "Start that server, or unset PLIANT_REDIS_URL to use the embedded one."
     from pliant.worker.errors import WorkerError
     from pliant.worker.store.connection import check_server

@@ -58,6 +58,7 @@ _CODES: tuple[tuple[str, str, Exit], ...] = (
     ("pliant.worker.errors", "DataDirectoryInUse", Exit.NOT_NOW),
     ("pliant.worker.errors", "BadBackup", Exit.REFUSED),
     ("pliant.worker.errors", "NewerData", Exit.NOT_NOW),
+    ("pliant.worker.errors", "TimedOut", Exit.FAILED),
     ("pliant.worker.errors", "WorkerError", Exit.UNREACHABLE),
 )
 """Exit codes of error classes; the first match applies. Classes are given by name, so that no module is imported for the lookup."""

@@ -25,6 +25,7 @@ from pliant.worker.formats import Limits, store_inputs
 from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.point_names import one_line
 from pliant.worker.formats.tracks.film_tracks import tracks_options
+from pliant.worker.formats.tracks.pixels import FRACTIONS
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
 from pliant.worker.uploads.service import Uploads
@@ -128,7 +129,7 @@ class Kept:
     form: Form
     """The form, with the earlier job's film if it had one."""
     options: Options
-    """The given options; for tracks, those in `READING` are the earlier job's."""
+    """The given options; for tracks, those of `reading_options` are the earlier job's."""
     canonical: Path | None
     """The tracks as they were read; None for a film, which is tracked again."""
 
@@ -166,7 +167,8 @@ def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept 
             if path is not None
         }
         return Kept(job, Form(files=files, texts={**form.texts, KEPT: id}), options, None)
-    for name in READING:
+    fixed = reading_options(job.interpretation)
+    for name in fixed:
         wanted, had = getattr(options, name), getattr(job.options, name)
         if name in options.model_fields_set and wanted != had:
             kept = "no value" if had is None else repr(had)
@@ -174,8 +176,13 @@ def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept 
                 ProblemCode.CONFLICTING_PARTS, field=f"options.{name}", expected=f"{kept}, as the inputs of job {id!r} were read",
                 got=repr(wanted), hint="Send the files again to read them in another way.",
             )  # fmt: skip
-    had = {name: getattr(job.options, name) for name in READING}
+    had = {name: getattr(job.options, name) for name in fixed}
     return Kept(job, form, options.model_copy(update=had), file)
+
+
+def reading_options(interpretation: Interpretation) -> tuple[str, ...]:
+    """Return the options that determined how tracks were read: `READING`, and `image_size` if it converted fractions to pixels."""
+    return (*READING, "image_size") if interpretation.coordinates in FRACTIONS else READING
 
 
 def with_uploads(form: Form, folder: Path, uploads: Uploads) -> Form:

@@ -92,24 +92,6 @@ def choose_weights(
     return given, noise, {"weights": reason}
 
 
-def without_effect(settings: Settings, *, with_mesh: bool) -> tuple[str, ...]:
-    """Return a sentence for each setting that has no effect in combination with the others, or without a mesh."""
-    sentences = []
-    if settings.low_rank_weight is not None and settings.prior != "smooth+low_rank":
-        sentences.append(f"low_rank_weight has no effect with prior {settings.prior}; set prior to smooth+low_rank.")
-    if settings.temporal_order is not None and settings.gaussian:
-        sentences.append("temporal_order has no effect with prior gaussian; set prior to smooth or smooth+low_rank.")
-    if settings.precision == "float32" and settings.gaussian:
-        sentences.append("precision has no effect with prior gaussian, which needs float64.")
-    for name, given in (
-        ("laplacian", settings.laplacian != "auto"),
-        ("spatial_weight", settings.spatial_weight is not None),
-    ):
-        if given and not with_mesh:
-            sentences.append(f"{name} has no effect without a mesh.")
-    return tuple(sentences)
-
-
 @dataclass(frozen=True, slots=True)
 class Roughness:
     """Noise and jumps of the tracks, estimated from third differences over frames."""

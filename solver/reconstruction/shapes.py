@@ -10,6 +10,7 @@ from pliant.solver.monitor import Monitor
 from pliant.solver.reconstruction.camera_report import with_camera_choice
 from pliant.solver.reconstruction.solution import finish
 from pliant.solver.reconstruction.start import Start
+from pliant.solver.reconstruction.unused_settings import without_effect
 from pliant.solver.records import Step
 from pliant.solver.shapes.assessment import assessed
 from pliant.solver.shapes.inliers import with_inlier_probability
@@ -113,6 +114,10 @@ def _finished(
     choices = with_camera_choice(
         start.choices, estimate.perspective, start.settings, unit=normalized.unit, known=observations.known
     )
+    unused = without_effect(
+        start.settings, with_mesh=start.mesh is not None, known_cameras=observations.known is not None
+    )
+    choices = replace(choices, warnings=(*choices.warnings, *unused))
     monitor.enter("finish")
     monitor()
     solution = finish(problem, history, outcome, normalized=normalized, estimate=estimate, choices=choices)

@@ -10,6 +10,7 @@ from pliant.solver.errors import InvalidSettings
 from pliant.solver.evaluation.trust import Verdict
 from pliant.solver.isometry.surface import IsometricVerdict, isometric_surface, sheetlike
 from pliant.solver.monitor import Monitor
+from pliant.solver.reconstruction.unused_settings import without_effect
 from pliant.solver.records import KnownCamera, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.inliers import with_inlier_probability
@@ -84,9 +85,12 @@ def solution_of(
     solution = isometric_solution(
         tracks, verdict, settings, unit=normalized.unit, seconds=seconds, stopped=monitor.stopped
     )
+    unused = without_effect(settings, isometric=True)
+    solution = replace(solution, choices=replace(solution.choices, warnings=(*solution.choices.warnings, *unused)))
     used = np.where(solution.weights > 0, tracks.visible, 0.0)
+    solution = with_inlier_probability(solution, tracks, used, full_confidence=normalized.full_confidence, loss="l2")
     monitor.report(Step("finish", 1.0, max_reweightings=settings.max_reweightings))
-    return with_inlier_probability(solution, tracks, used, full_confidence=normalized.full_confidence, loss="l2")
+    return solution
 
 
 def with_verdict(solution: Solution, verdict: IsometricVerdict, settings: Settings) -> Solution:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.energy.hyperparameters import bending_weight, choose_weights, without_effect
+from pliant.solver.energy.hyperparameters import bending_weight, choose_weights
 from pliant.solver.energy.problem import Problem
 from pliant.solver.mesh import Mesh
 from pliant.solver.model.shape_covariance import ShapeCovariance
@@ -53,7 +53,7 @@ def build_problem(
         basis_size=estimate.basis_size, temporal_weight=weights.temporal, spatial_weight=weights.spatial,
         robust_scale=weights.robust_scale, temporal_order=weights.order, low_rank_weight=weights.low_rank,
         laplacian=laplacian.name if laplacian is not None else "none", unit=normalized.unit, noise=noise * normalized.unit,
-        reasons={**estimate.reasons, **reasons}, warnings=(*estimate.warnings, *without_effect(settings, with_mesh=mesh is not None)),
+        reasons={**estimate.reasons, **reasons}, warnings=estimate.warnings,
     )  # fmt: skip
     return problem, choices
 

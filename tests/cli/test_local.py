@@ -243,7 +243,12 @@ def test_doctor_checks_the_queue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         (found,) = doctor.check_valkey()
         assert "secret" not in found.found
         assert verdicts(doctor.check_port(port)) == {"port": "note"}
-        for wrong in (f"redis://:wrong@127.0.0.1:{port}/0", f"redis://127.0.0.1:{port}/0", "http://nothing"):
+        for wrong in (
+            f"redis://:wrong@127.0.0.1:{port}/0",
+            f"redis://127.0.0.1:{port}/0",
+            "http://nothing",
+            "unix:///no/socket",
+        ):
             monkeypatch.setenv("PLIANT_REDIS_URL", wrong)
             (found,) = doctor.check_valkey()
             assert found.verdict == "bad", wrong
@@ -271,6 +276,10 @@ def test_doctor_checks_the_blob_store(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setenv("PLIANT_BLOB_URL", (tmp_path / "blobs").as_uri())
     assert verdicts(doctor.check_blobs()) == {"blobs": "good"}
     (tmp_path / "file").write_text("")
+    monkeypatch.setenv("PLIANT_BLOB_URL", "bucket")
+    (found,) = doctor.check_blobs()
+    assert found.verdict == "bad"
+    assert "PLIANT_BLOB_URL" in found.found
     monkeypatch.setenv("PLIANT_BLOB_URL", (tmp_path / "file" / "below").as_uri())
     (found,) = doctor.check_blobs()
     assert found.verdict == "bad"

@@ -23,6 +23,7 @@ from pliant.cli.show import details_of, explained_at
 from pliant.client import BadArgument
 from pliant.schemas.problems import ProblemCode
 from pliant.service.testing import InMemoryService
+from pliant.worker.errors import TimedOut
 from pliant.worker.settings import NUMERICAL_THREADS
 from serving import until
 from typer.testing import CliRunner, Result
@@ -200,6 +201,7 @@ def test_system_errors_have_a_message_and_defects_a_traceback(tmp_path: Path) ->
         tmp_path.open("wb")
     assert code_of(caught.value) == Exit.REFUSED
     assert sentence_of(caught.value) == f"{tmp_path}: Is a directory."
+    assert code_of(TimedOut(1.0)) == Exit.FAILED
     assert code_of(ZeroDivisionError()) is None
     assert code_of(OSError("no file is named")) is None
 

@@ -243,7 +243,19 @@ def test_films_are_told_apart_from_track_files_and_spreadsheets(film: Path, tmp_
     moved = tmp_path / "named-like-tracks.npy"
     moved.write_bytes(film.read_bytes())
     films.write_film(tmp_path / "a.avi", films.textured_pictures(3))
-    given = (film, moved, pictures, tmp_path, tmp_path / "list.mp4", tmp_path / "missing.mov", tmp_path / "a.avi")
+    scans = films.zip_of(
+        tmp_path / "scans.zip", {"1.tif": b"", "2.tif": b""}
+    )  # refused as a film, with the accepted formats
+    given = (
+        film,
+        moved,
+        pictures,
+        scans,
+        tmp_path,
+        tmp_path / "list.mp4",
+        tmp_path / "missing.mov",
+        tmp_path / "a.avi",
+    )
     assert [path for path in given if not looks_like_film(path)] == []
     sheets = {
         "a.xlsx": ("[Content_Types].xml", "xl/workbook.xml", "xl/media/image1.png"),
@@ -259,7 +271,8 @@ def test_films_are_told_apart_from_track_files_and_spreadsheets(film: Path, tmp_
 def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Path, tmp_path: Path) -> None:
     steps: list[Progress] = []
     (tmp_path / "scratch").mkdir()
-    options = Options(outputs=(), max_reweightings=2, grid_step=6, refine_rotations=False)
+    options = Options(outputs=(), max_reweightings=2, grid_step=6, refine_rotations=False, principal_point="60,30")
+    options = film_options(options, check_film(FilmSource(film, region), options))
     done = reconstruct_film(
         FilmSource(film, region), options, tmp_path / "out", scratch=tmp_path / "scratch", on_progress=steps.append
     )
@@ -448,6 +461,8 @@ def test_implausible_warnings_are_ignored(stated: object) -> None:
 
 
 def test_the_time_estimate_includes_the_isometric_surface_search() -> None:
-    free, auto = (solving_seconds(30, 900, Options(surface=surface)) for surface in ("free", "auto"))
+    free, auto = (
+        solving_seconds(30, 900, Options(surface=surface, image_size="640x480")) for surface in ("free", "auto")
+    )
     assert 1 < free < auto
-    assert solving_seconds(60, 900, Options(surface="free")) > free
+    assert solving_seconds(60, 900, Options(surface="free", image_size="640x480")) > free

@@ -44,7 +44,7 @@ def out_of_memory(limit: int = 0) -> Problem:
     there = f"{limit / 2**30:.1f} GiB" if limit else "the machine has"
     return Problem.of(
         "out_of_memory",
-        detail=f"The job needed more memory than {there}. Send fewer points or frames, set precision to float32, "
+        detail=f"The job needed more memory than {there}. Send fewer points or frames, "
         "or retry where there is more memory.",
     )
 

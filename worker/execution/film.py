@@ -61,7 +61,7 @@ def reconstruct_film(
         reporter.part("track", 0.0)
         began = time.perf_counter()
 
-        def told(done: float, size: tuple[int, int] | None, followed: FollowedPoints | None) -> None:
+        def report_progress(done: float, size: tuple[int, int] | None, followed: FollowedPoints | None) -> None:
             if size is not None:
                 reporter.following_seconds = pace.measure() * solving_seconds(*size, options)
             reporter.part("track", done, followed=followed)
@@ -69,7 +69,7 @@ def reconstruct_film(
         try:
             tracked = track_film(
                 source, options, scratch, bounds=bounds, threads=threads,
-                on_progress=told, on_warnings=on_warnings, should_stop=halt.requested,
+                on_progress=report_progress, on_warnings=on_warnings, should_stop=halt.requested,
             )  # fmt: skip
         except Interrupted:
             halt.check()
@@ -94,8 +94,8 @@ def reconstruct_film(
 
 
 def solving_seconds(frames: int, points: int, options: Options) -> float:
-    """Return the planned seconds of solving a film's tracks, whose image size is known, at a `MachinePace` of 1."""
-    settings = replace(solver_settings(options), image_size=(1.0, 1.0))  # any size: only whether it is known matters
+    """Return the planned seconds of solving a film's tracks at a `MachinePace` of 1; the options contain the film's `image_size`."""
+    settings = solver_settings(options)
     sheet = tries_isometry(None, settings)
     stages = planned(frames, points, gaussian=settings.gaussian, known_cameras=False, sheet=sheet)
     return sum(stage.seconds for stage in stages)

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from pliant.schemas.job import Interpretation
 from pliant.worker.formats.errors import damaged
-from pliant.worker.formats.reading.arrays import spreadsheet_kind
+from pliant.worker.formats.reading.arrays import PICTURE_SUFFIXES, spreadsheet_kind
+from pliant.worker.formats.reading.parsers import film_kind
 
 VERSION = 1
 _MARK, _FILM, _REGION = "film.json", "film", "region"
@@ -55,9 +56,7 @@ def looks_like_film(path: Path) -> bool:
             head = file.read(16)
     except OSError:
         return path.suffix.lower() in SUFFIXES
-    if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide") or head.startswith((b"\x1aE\xdf\xa3", b"GIF8")):
-        return True
-    if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
+    if film_kind(head) is not None:
         return True
     if head.startswith(b"PK") and path.suffix.lower() != ".npz":
         return _holds_pictures(path)
@@ -70,7 +69,7 @@ def _holds_pictures(path: Path) -> bool:
             names = archive.namelist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
         return False
-    return spreadsheet_kind(names) is None and any(name.lower().endswith(PICTURES) for name in names)
+    return spreadsheet_kind(names) is None and any(name.lower().endswith(PICTURE_SUFFIXES) for name in names)
 
 
 def save_source(source: FilmSource, interpretation: Interpretation, target: Path) -> None:

@@ -56,6 +56,24 @@ def test_a_repeated_rerun_finds_its_job_after_the_original_is_deleted(running: R
     assert again(http, first).json()["code"] == "unknown_job"
 
 
+@pytest.mark.parametrize("coordinates", ["unit", "signed", "pixels"])
+def test_a_rerun_keeps_the_image_size_that_converted_fractions(
+    running: Running, http: httpx.Client, coordinates: str
+) -> None:
+    body = npz(tracks=np.random.default_rng(0).uniform(0.1, 0.9, (6, 12, 2)))
+    first = submit(http, body=body, options={"coordinates": coordinates, "image_size": "640x480"})
+    finish(running, first.id, b"x")
+    second = Job.model_validate_json(again(http, first).content)
+    fractions = coordinates != "pixels"
+    assert second.options.image_size == ("640x480" if fractions else None)
+    other = http.post(
+        "/v1/jobs", files={"inputs_of": (None, first.id), "options": (None, '{"image_size": "6400x4800"}')}
+    )
+    assert other.status_code == (422 if fractions else 202)
+    if fractions:
+        assert (other.json()["code"], other.json()["field"]) == ("conflicting_parts", "options.image_size")
+
+
 def test_a_rerun_with_contradictory_options_is_rejected(running: Running, http: httpx.Client) -> None:
     first = submit(http)
     finish(running, first.id, b"x")

@@ -59,37 +59,6 @@ def test_the_low_rank_prior_is_used_only_on_request(face: gallery.Sequence) -> N
     assert not any("no effect" in warning for warning in asked.warnings)
 
 
-def test_a_weight_without_effect_gives_a_warning(face: gallery.Sequence) -> None:
-    warnings = solved(face, face.tracks, temporal_order=2, low_rank_weight=1.0, max_reweightings=1).choices.warnings
-    assert [warning.split()[0] for warning in warnings if "no effect" in warning] == [
-        "low_rank_weight",
-        "temporal_order",
-    ]
-    plain = solved(face, face.tracks, temporal_order=2, prior="smooth", max_reweightings=1).choices
-    assert not any("no effect" in warning for warning in plain.warnings)
-
-
-@pytest.mark.parametrize("options", [{"laplacian": "grid8"}, {"laplacian": "cotangent"}, {"spatial_weight": 1.0}])
-def test_smoothness_along_a_surface_has_no_effect_without_a_mesh(
-    face: gallery.Sequence, options: dict[str, Any]
-) -> None:
-    quick = {**options, "prior": "smooth", "max_reweightings": 1}
-    without = solved(face, face.tracks, mesh=False, **quick).choices
-    assert [each for each in without.warnings if "no effect" in each] == [
-        f"{next(iter(options))} has no effect without a mesh."
-    ]
-    assert not any("no effect" in each for each in solved(face, face.tracks, **quick).choices.warnings)
-
-
-@pytest.mark.slow
-def test_the_gaussian_prior_is_always_solved_in_double_precision(face: gallery.Sequence, default: Solution) -> None:
-    assert Settings().precision == "float64"
-    single = solved(face, face.tracks, precision="float32")
-    np.testing.assert_array_equal(single.shapes, default.shapes)
-    assert any("needs float64" in warning for warning in single.choices.warnings)
-    assert not any("needs float64" in warning for warning in default.choices.warnings)
-
-
 @pytest.mark.slow
 def test_the_default_is_robust_to_outliers_that_ruin_least_squares(face: gallery.Sequence, default: Solution) -> None:
     spoiled = gallery.corrupt(face, outliers=0.1, seed=3).tracks

@@ -42,7 +42,8 @@ TRACK_FILES = "npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe ex
 MESH_FILES = "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"
 """Supported files, as named in error messages."""
 
-PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+"""Names of pictures. Not all of these formats are accepted as a film."""
 
 END_OF_DIRECTORY = b"PK\x05\x06"
 ZIP64_LOCATOR = b"PK\x06\x07"
@@ -175,7 +176,11 @@ def checked_members(
         raise too_large(field, expected=f"at most {limits.max_members:,} members", got=f"{len(infos)}")
     if any(info.filename.endswith("data.pkl") for info in infos):
         raise pickle_refusal(field)
-    if field == "tracks" and infos and all(info.filename.lower().endswith(PICTURES) or info.is_dir() for info in infos):
+    if (
+        field == "tracks"
+        and infos
+        and all(info.filename.lower().endswith(PICTURE_SUFFIXES) or info.is_dir() for info in infos)
+    ):
         raise film_as_tracks("a zip of pictures")
     members: dict[str, zipfile.ZipInfo] = {}
     for info in infos:

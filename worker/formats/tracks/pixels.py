@@ -14,6 +14,8 @@ from pliant.worker.formats.records import MAX_COORDINATE
 
 MAX_COMPARED = 100_000
 SLACK = 0.02
+FRACTIONS = ("unit", "signed")
+"""Kinds of coordinates that are fractions of the picture."""
 MIN_INSIDE_SHARE = 0.9
 """Share of points that must be inside the picture for coordinates to count as fractions of it; none may be a picture size outside."""
 
