@@ -166,6 +166,8 @@ def _verdict(result: Job | Finished) -> tuple[str, str]:
 
 def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
     """Return the interpretation of the inputs as pairs of label and text."""
+    if interpretation.mesh_source == "film" and interpretation.num_points == 0:  # not tracked yet
+        return [("film", note) for note in interpretation.notes]
     given = [
         name for name, there in
         (("ground truth", interpretation.has_ground_truth), ("cameras", interpretation.has_rotations)) if there

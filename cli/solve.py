@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from pliant.cli.films import inspect_film, is_film, refuse_parts_of_tracks, solve_film
+from pliant.cli.films import as_one_file, inspect_film, is_film, refuse_parts_of_tracks, solve_film
 from pliant.cli.paths import check_inputs, results_folder
 from pliant.cli.session import (
     LINE_EVERY,
@@ -148,12 +148,13 @@ def inspect(
             tracks=file, mesh=faces, ground_truth=ground_truth, rotations=rotations, options=checked
         ).interpretation
     else:
-        with ctx.obj.client(url, as_json=as_json) as client:
+        with ctx.obj.client(url, as_json=as_json) as client, as_one_file(file) as sent:
             interpretation = client.inspect(
-                file, mesh=mesh, ground_truth=ground_truth, rotations=rotations, options=options
-            )
+                **{"film" if is_film(file, region) else "tracks": sent}, region=region, mesh=mesh,
+                ground_truth=ground_truth, rotations=rotations, options=options,
+            )  # fmt: skip
     if as_json:
-        print_json(interpretation.model_dump(mode="json"))
+        print_json(interpretation.model_dump(mode="json", exclude={"sample", "first_frame"}))
     else:
         show_understood(interpretation)
 

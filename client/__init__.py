@@ -35,7 +35,7 @@ if TYPE_CHECKING:
         WaitTimeout,
     )
     from pliant.client.retry import Retry
-    from pliant.schemas.job import Artifact, Interpretation, Job, Problem, Progress, ServiceLimits, Status
+    from pliant.schemas.job import Artifact, Inspection, Interpretation, Job, Problem, Progress, ServiceLimits, Status
     from pliant.schemas.options import Options
     from pliant.schemas.shares import Share
 
@@ -55,13 +55,14 @@ _HOME_OF = {name: f"pliant.client.{module}" for module, names in _HOMES.items() 
     "Options": "pliant.schemas.options",
     "Share": "pliant.schemas.shares",
     **dict.fromkeys(
-        ("Artifact", "Interpretation", "Job", "Problem", "Progress", "ServiceLimits", "Status"), "pliant.schemas.job"
+        ("Artifact", "Inspection", "Interpretation", "Job", "Problem", "Progress", "ServiceLimits", "Status"),
+        "pliant.schemas.job",
     ),
 }
 
 __all__ = [  # noqa: RUF022 - by use, not by alphabet
     "Client", "RemoteJob", "Result", "AsyncClient", "AsyncRemoteJob", "AsyncResult", "Retry", "Options",
-    "Artifact", "Interpretation", "Job", "Problem", "Progress", "ServiceLimits", "Share", "Status",
+    "Artifact", "Inspection", "Interpretation", "Job", "Problem", "Progress", "ServiceLimits", "Share", "Status",
     "PliantError", "Unreachable", "WaitTimeout", "UnexpectedAnswer", "CorruptDownload", "BadArgument", "NotLoaded",
     "InvalidSignature", "APIStatusError", "InvalidRequest", "NotAuthorized", "NotFound", "NotAllowedNow", "TooManyRequests",
     "ServiceFailed", "JobEnded", "JobFailed", "JobCancelled",

@@ -21,10 +21,12 @@ LIGHT = np.array([-0.5, -0.6, 0.62])
 """Direction of the light in the plot's axes: right, away from the viewer, up. Both sides of a surface are lit."""
 
 
-def draw(shapes: NDArray[np.float64], faces: NDArray[np.int32], frames: int, *, title: str) -> Figure:
+def draw(
+    shapes: NDArray[np.float64], faces: NDArray[np.int32], frames: int, *, title: str, y_axis: str = "down"
+) -> Figure:
     """Draw evenly spaced frames side by side at one scale: the lit surface, or points coloured by depth.
 
-    Shapes `(F, P, 3)` have y down as in images and are drawn with y up. Without faces, or with too many, only points are drawn.
+    Shapes `(F, P, 3)` have y down as in images, or up; they are drawn upright. Without faces, or with too many, only points are drawn.
 
     Raises
     ------
@@ -43,7 +45,8 @@ def draw(shapes: NDArray[np.float64], faces: NDArray[np.int32], frames: int, *, 
     for place, frame in enumerate(shown, start=1):
         axes: Axes3D = figure.add_subplot(1, len(shown), place, projection="3d", proj_type="ortho")
         x, y, z = shapes[frame].T
-        upright = np.stack([x, z, -y], axis=1)  # matplotlib's third axis points up
+        # matplotlib's third axis points up, its second one away from the viewer
+        upright = np.stack([x, z, -y] if y_axis == "down" else [x, -z, y], axis=1)
         if 0 < len(triangles) <= MOST_TRIANGLES:
             _surface(axes, upright, triangles)
         else:

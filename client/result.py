@@ -139,7 +139,8 @@ class Reconstruction:
         """
         from pliant.client.plot import draw
 
-        return draw(self.shapes, self.faces, frames, title=self.job.name if self.job.name != "" else self.job.id)
+        title = self.job.name if self.job.name != "" else self.job.id
+        return draw(self.shapes, self.faces, frames, title=title, y_axis=self.job.interpretation.y_axis)
 
     def _local(self, name: str) -> Path:
         path = self.folder / name

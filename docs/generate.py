@@ -55,7 +55,7 @@ ANSWER_RECORDS = (
 )  # fmt: skip
 """Records of the other answers."""
 
-SDK_RECORDS = ("Job", "Interpretation", "Progress", "Artifact", "Problem", "Share", "ServiceLimits")
+SDK_RECORDS = ("Job", "Interpretation", "Inspection", "Progress", "Artifact", "Problem", "Share", "ServiceLimits")
 INNER = ("Estimate", "FollowedPoints")
 """Records of the SDK: exported by `pliant.client`, and contained in those."""
 
@@ -203,6 +203,7 @@ def records() -> str:
         rows = [
             (f"`{name}`", f"`{model.__annotations__[name]}`", (field.description or "").replace("null", "None"))
             for name, field in model.model_fields.items()
+            if name in model.__annotations__  # without those of its base class, which has its own entry
         ]
         parts.append(f"::: {home}\n    options:\n      members: false\n\n{_table(('field', 'type', 'meaning'), rows)}")
     return "\n\n".join(parts)

@@ -71,7 +71,7 @@ def normal(sentence: str) -> str:
 def warnings_in_source() -> set[str]:
     """Return sentences of functions named after warnings and of `without_effect`, with values as `…`."""
     found = set()
-    for path in (ROOT / "solver").rglob("*.py"):
+    for path in (*(ROOT / "solver").rglob("*.py"), *(ROOT / "worker" / "artifacts").glob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.FunctionDef) and ("warning" in node.name or node.name == "without_effect"):
                 body = [each for each in node.body if each is not documentation(node)]

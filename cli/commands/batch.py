@@ -135,7 +135,12 @@ class Batch:
             made_folder(self.output / each, "--output")
 
     def run(self, client: Client) -> None:
-        """Submit all files and, if requested, wait for the jobs. A failure is recorded in its row and does not stop the others."""
+        """Submit all files and, if requested, wait for the jobs.
+
+        A failure is recorded in its row and does not stop the others. Only a service that refuses the token or cannot be reached for
+        a submission ends the command.
+        """
+        from pliant.client.errors import PliantError
         from pliant.client.progress import progress_bar
 
         with progress_bar(line_every=LINE_EVERY) as bar:
@@ -144,7 +149,11 @@ class Batch:
                 self.session.following, self.session.others = job.id, len(submitted) - index - 1
                 bar.label = str(row.file)
                 self._follow(row, job, bar)
-                row.job = client.get(job.id).record
+                try:
+                    row.job = client.get(job.id).record
+                except PliantError as error:
+                    row.error = row.error or error
+                    continue
                 err().print(f"{row.file}: {row.job.status}")
 
     def _submit(self, client: Client, bar: Bar) -> list[tuple[Row, RemoteJob]]:
@@ -154,8 +163,10 @@ class Batch:
         ------
         NotAuthorized
             The token is missing or lacks a scope, so that every other file would be refused, too.
+        Unreachable
+            The service does not answer.
         """
-        from pliant.client.errors import APIStatusError, NotAuthorized
+        from pliant.client.errors import NotAuthorized, PliantError, Unreachable
 
         submitted: list[tuple[Row, RemoteJob]] = []
         secret = os.environ.get("PLIANT_WEBHOOK_SECRET") if self.shared.get("webhook") else None
@@ -172,9 +183,9 @@ class Batch:
                         idempotency_key=_key_of(sent, name_of("", file), common), priority=self.priority, timeout=self.timeout,  # type: ignore[arg-type]
                         webhook_secret=secret, on_upload=bar.on_upload, **self.shared,
                     )  # fmt: skip
-            except NotAuthorized:
+            except (NotAuthorized, Unreachable):
                 raise
-            except APIStatusError as error:
+            except PliantError as error:
                 row.error = error
                 continue
             row.job = job.record

@@ -29,7 +29,7 @@ from pliant.client.pauses import in_place
 from pliant.client.requests import further, key_header, sharing, status_names
 from pliant.client.result import finished, job_path, loaded, succeeded
 from pliant.client.retry import SUBMISSION
-from pliant.schemas.job import Interpretation, Job, JobPage, Priority, ServiceLimits, Status
+from pliant.schemas.job import Inspection, Job, JobPage, Priority, ServiceLimits, Status
 from pliant.schemas.options import Options, Output
 from pliant.schemas.shares import Share
 
@@ -199,8 +199,10 @@ class Client(Connection):
 
     def inspect(
         self,
-        tracks: Source,
+        tracks: Source | None = None,
         *,
+        film: Path | str | None = None,
+        region: Region | None = None,
         visible: ArrayLike | None = None,
         mesh: Source | tuple[int, int] | None = None,
         ground_truth: Source | None = None,
@@ -208,13 +210,17 @@ class Client(Connection):
         options: Options | Mapping[str, Any] | None = None,
         on_upload: OnBytes | None = None,
         timeout: float | None = None,
-    ) -> Interpretation:
+    ) -> Inspection:
         """Let the service read and validate inputs without creating a job.
 
         Parameters
         ----------
         tracks : array_like, mapping or path
             Points (F, P, 2), the dictionary of a tracker, or the path of a file, as for `submit`.
+        film : path, optional
+            A film instead of tracks. It is opened, not tracked.
+        region : path or array, optional
+            Region to track in the film, as for `submit`.
         visible : array_like, optional
             Shape (F, P), bool or confidence in [0, 1]; only with an array of tracks.
         mesh : array_like, (rows, columns), path, optional
@@ -232,21 +238,24 @@ class Client(Connection):
 
         Returns
         -------
-        Interpretation
-            Frames, points, layout, hidden share, source of the mesh, and the evidence for each interpretation.
+        Inspection
+            Frames, points, layout, hidden share, source of the mesh, and the evidence for each interpretation. `sample` has some
+            points in some frames; `first_frame` is a film's first frame.
 
         Raises
         ------
         InvalidRequest
             As for `submit`; `problem.choices` lists the possible interpretations of an ambiguous file.
         """
-        inputs = Inputs(tracks=tracks, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations)
+        inputs = Inputs(
+            tracks=tracks, film=film, region=region, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations
+        )  # fmt: skip
         exchange = self._exchange(timeout, "the inspection")
         with tempfile.TemporaryDirectory(prefix="pliant-inspect-") as folder:
             report = exchange.attempts.bounding(on_upload)
             form = in_place(partial(inputs.form, Path(folder), option_fields(options), report))
             call = Call(method="POST", path="/v1/inspect", form=form, changes_nothing=True)
-            return exchange.record(call, Interpretation)
+            return exchange.record(call, Inspection)
 
     def get(self, job: str, *, timeout: float | None = None) -> RemoteJob:
         """Return a job with its current record."""

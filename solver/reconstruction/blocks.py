@@ -260,14 +260,14 @@ class _Whole:
         return replace(solution, choices=self._choices(), trust=self._judged(solution))
 
     def _choices(self) -> Choices:
-        """Return the choices, with medians of those that each block makes, and the warnings of all blocks."""
+        """Return the choices, with medians of those that each block makes, and the warnings and reasons of all blocks."""
         every = [part.choices for part in self._parts]
         values = {name: float(np.median([getattr(each, name) for each in every])) for name in CHOSEN_BY_BLOCK}
-        reasons = dict(every[0].reasons)
+        reasons = _merged([each.reasons for each in every])
         if "outliers" in reasons:
             reasons["outliers"] = outlier_reason(self._rejected, self._seen, self._cameras.outliers)
         if len({each.temporal_weight for each in every}) > 1:
-            reasons["weights"] = f"Medians of {len(every)} blocks of points. The first: {reasons['weights']}"
+            reasons["weights"] = f"Medians of {len(every)} blocks of points. The first: {every[0].reasons['weights']}"
         warnings = tuple(dict.fromkeys(warning for each in every for warning in each.warnings))
         return replace(every[0], reasons=reasons, warnings=warnings, **values)  # type: ignore[arg-type]
 
@@ -289,6 +289,17 @@ class _Whole:
             few, tracks, confidence, self._cameras.estimate if prior is None else estimate_with(self._cameras, prior),
             None if prior is None else prior.normalized, held_out_error=float(np.median(left_out)) if left_out else None,
         )  # fmt: skip
+
+
+def _merged(reasons: list[dict[str, str]]) -> dict[str, str]:
+    """Return the reasons that all blocks agree on; of those that differ between blocks, the first one, named as such."""
+    merged: dict[str, str] = {}
+    for name in dict.fromkeys(name for each in reasons for name in each):
+        every = [each.get(name) for each in reasons]
+        first = next(each for each in every if each is not None)
+        alike = all(each == first for each in every)
+        merged[name] = first if alike else f"In one of {len(reasons)} blocks of points: {first}"
+    return merged
 
 
 def _summed(traces: list[Trace]) -> Trace:

@@ -15,6 +15,7 @@ import pytest
 from pliant.cli import app
 from pliant.cli.exits import Exit
 from pliant.cli.session import Session
+from pliant.client import BadArgument, Client, RemoteJob
 from pliant.client.input_files import LONGEST_NAME
 from pliant.service.testing import InMemoryService
 from typer.testing import CliRunner, Result
@@ -150,6 +151,40 @@ def test_a_rejected_file_is_reported_and_the_others_continue(run: Run, takes: Pa
         )
     ]
     assert len(jobs_of(run)) == 2
+
+
+def test_a_job_deleted_while_it_is_followed_is_reported_and_the_others_continue(
+    run: Run, takes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wait, deleted = RemoteJob.wait, []
+
+    def delete_the_first(job: RemoteJob, **more: Any) -> Any:
+        done = wait(job, **more)
+        if not deleted:
+            deleted.append(job.id)
+            job.delete()
+        return done
+
+    monkeypatch.setattr(RemoteJob, "wait", delete_the_first)
+    ran = run("submit", takes, "--mesh", "none", "--wait", "--json")
+    assert ran.exit_code == Exit.FAILED, ran.output
+    assert [row["error"] is None for row in json.loads(ran.stdout)] == [False, True, True]
+
+
+def test_a_file_that_the_client_rejects_is_reported_and_the_others_continue(
+    run: Run, takes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    submit = Client.submit
+
+    def reject_the_second(client: Client, *given: Any, **more: Any) -> RemoteJob:
+        if more["name"] == "take-1":
+            raise BadArgument("tracks: expected another file.")
+        return submit(client, *given, **more)
+
+    monkeypatch.setattr(Client, "submit", reject_the_second)
+    ran = run("submit", takes, "--mesh", "none", "--json")
+    assert ran.exit_code == Exit.FAILED, ran.output
+    assert [row["error"] for row in json.loads(ran.stdout)] == [None, "tracks: expected another file.", None]
 
 
 def test_a_file_with_a_used_key_is_reported_and_the_others_continue(

@@ -43,3 +43,16 @@ def test_points_are_drawn_if_a_mesh_is_missing_or_too_large(monkeypatch: pytest.
         True,
         True,
     ]
+
+
+@pytest.mark.parametrize("y_axis", ["down", "up"])
+def test_both_directions_of_y_are_drawn_upright_seen_from_the_camera(y_axis: str) -> None:
+    """The camera looks along z with y down, against z with y up."""
+    right, upwards, nearer = np.eye(3)
+    if y_axis == "down":
+        upwards, nearer = -upwards, -nearer
+    shape = np.array([0 * right, right, upwards, nearer])
+    figure = plot.draw(shape[None], np.zeros((0, 3), np.int32), 1, title="", y_axis=y_axis)
+    (points,) = figure.axes[0].collections
+    drawn = np.stack(points._offsets3d, axis=1)
+    np.testing.assert_array_equal(drawn, [[0, 0, 0], [1, 0, 0], [0, 0, 1], [0, -1, 0]])

@@ -117,6 +117,8 @@ def test_film_limits_come_from_the_settings(film: Path) -> None:
     assert (bounds.max_bytes, bounds.max_frames, bounds.max_pixels, bounds.max_seconds) == (10**6, 8, 5000, 2.0)
     assert bounds.memory == settings.film_memory == FilmBounds().memory
     assert FilmBounds.of(Settings(memory_limit=1 << 30)).memory == 1 << 30
+    assert FilmBounds.of(Settings(time_limit=7200)).track_seconds == 7200
+    assert FilmBounds.of(Settings(time_limit=0)).track_seconds == FilmBounds().track_seconds == 7 * 24 * 3600
     assert refusal(FilmSource(film), bounds=bounds).code == "too_many_pixels"
 
 

@@ -16,6 +16,7 @@ import pytest
 from crafting import png
 from PIL import Image
 from pliant.cli import app
+from pliant.cli.exits import Exit
 from pliant.cli.session import Session
 from pliant.client import BadArgument, Client
 from pliant.schemas.job import Job, Status
@@ -248,6 +249,10 @@ def test_client_and_command_line_send_films(running: Running, film: bytes, tmp_p
     with Client(running.url) as client:
         job = client.submit(film=path, region=region, options=QUICK)
         assert job.record.interpretation.mesh_source == "film"
+        read = client.inspect(film=path, region=region)
+        assert (read.format, read.image_size, read.num_frames) == ("film (mp4)", "96x72", 10)
+        with Image.open(io.BytesIO(base64.b64decode(read.first_frame or ""))) as picture:
+            assert picture.size == (96, 72)
         for wrong in ({}, {"tracks": np.zeros((4, 9, 2)), "film": path}):
             with pytest.raises(BadArgument, match="expected one of them"):
                 client.submit(**wrong)  # type: ignore[arg-type]
@@ -257,3 +262,12 @@ def test_client_and_command_line_send_films(running: Running, film: bytes, tmp_p
     ran = CliRunner().invoke(app, command, obj=Session())
     assert ran.exit_code == 0, ran.output
     assert json.loads(ran.stdout)["interpretation"]["format"] == "film (mp4)"
+    command[0] = "inspect"
+    ran = CliRunner().invoke(app, command, obj=Session())
+    assert ran.exit_code == 0, ran.output
+    assert json.loads(ran.stdout) == job.record.interpretation.model_dump(mode="json")
+    words = CliRunner().invoke(app, command[:-1], obj=Session()).output
+    assert words.split() == ["film", *job.record.interpretation.notes[0].split()]
+    region.write_bytes(mask((48, 36)))  # it is sent as well
+    refused = CliRunner().invoke(app, command[:-1], obj=Session())
+    assert (refused.exit_code, "region" in refused.output) == (Exit.REFUSED, True)

@@ -156,12 +156,17 @@ def test_choices_of_blocks_are_reported_as_medians_with_all_warnings(film: galle
     whole = blocks._Whole(film.tracks, estimate_cameras(film.tracks, given(film)), None, None)
     kept = np.arange(POINTS)
     for weight, warning in ((1.0, "one"), (3.0, "two"), (9.0, "one")):
-        choices = replace(solution.choices, temporal_weight=weight, warnings=(warning,))
+        reasons = dict(solution.choices.reasons, few=warning) | ({"late": "late"} if weight == 9 else {})
+        choices = replace(solution.choices, temporal_weight=weight, warnings=(warning,), reasons=reasons)
         whole.add(replace(solution, choices=choices), kept, kept)
     found = whole.solution(seconds={}).choices
     assert found.temporal_weight == 3
     assert found.warnings == ("one", "two")
     assert found.reasons["weights"].startswith("Medians of 3 blocks of points. The first: ")
+    assert (found.reasons["few"], found.reasons["late"]) == tuple(
+        f"In one of 3 blocks of points: {each}" for each in ("one", "late")
+    )
+    assert found.reasons["camera"] == solution.choices.reasons["camera"]
 
 
 def test_blocks_are_equal_parts_of_all_points(film: gallery.Sequence) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from pliant.schemas.options import Options
 from pliant.solver import Solution
 from pliant.solver.evaluation.metrics import point_errors
+from pliant.worker.artifacts.animation import MAX_FRAME_TARGETS
 from pliant.worker.artifacts.colours import Painting
 from pliant.worker.artifacts.geometry import Floats, Ints, size_of, upright
 from pliant.worker.formats import Inputs, Texture
@@ -104,3 +105,13 @@ class Result:
     def standing(self, frame: int) -> Floats:
         """Return the points `(P, 3)` of a frame, y up, right-handed."""
         return upright(self.solution.shapes[frame], self.y_axis)
+
+
+def file_warnings(options: Options, solution: Solution) -> tuple[str, ...]:
+    """Return a sentence for each option that has no effect on the files of this solution."""
+    sentences = []
+    if options.colours == "expected_error" and solution.shapes_std is None:
+        sentences.append("colours=expected_error has no effect, because the solution has no expected error.")
+    if options.glb_motion == "frames" and "glb" in options.outputs and len(solution.shapes) > MAX_FRAME_TARGETS:
+        sentences.append("glb_motion=frames has no effect, because the result has too many frames.")
+    return tuple(sentences)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pliant.schemas.job import Job, Progress
 from pliant.solver import Camera, Choices, Outcome, Solution, Trace
 from pliant.worker.artifacts import kinds_for
-from pliant.worker.artifacts.result import Result
+from pliant.worker.artifacts.result import Result, file_warnings
 from pliant.worker.artifacts.write import write_kinds, write_report
 from pliant.worker.execution.pipeline import Halt, silent
 from pliant.worker.execution.progress import Reporter
@@ -81,7 +81,7 @@ def write_further(
         verdict=job.verdict,
         verdict_reasons=tuple(job.verdict_reasons),
         trust_sentence=job.trust_sentence,
-        warnings=tuple(job.warnings),
+        warnings=tuple(dict.fromkeys((*job.warnings, *file_warnings(options, solution)))),
         artifacts=tuple(artifacts),
     )
 

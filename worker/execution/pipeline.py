@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pliant.schemas.job import Artifact, Progress
@@ -13,6 +13,7 @@ from pliant.schemas.options import Options
 from pliant.solver import Outcome, Solution, Step, solve
 from pliant.solver.evaluation.metrics import evaluate
 from pliant.worker.artifacts import build_report, kinds_for, write_artifacts
+from pliant.worker.artifacts.result import file_warnings
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.progress import Reporter
 from pliant.worker.execution.solver_settings import solver_settings
@@ -92,7 +93,8 @@ def solve_and_write(
     metrics = _metrics(inputs, solution)
     seconds = {**(spent or {}), "solve": solved - began, "metrics": time.perf_counter() - solved}
     report = build_report(inputs, solution, options, metrics=metrics, seconds=seconds, name=name)
-    report["warnings"] = [*warnings, *report["warnings"]]
+    of_files = file_warnings(options, solution)
+    report["warnings"] = [*warnings, *report["warnings"], *of_files]
     report["artifacts"] = {each.name: {"bytes": each.bytes, "sha256": each.sha256} for each in earlier}
 
     def exported(done: float) -> None:
@@ -101,7 +103,8 @@ def solve_and_write(
 
     artifacts = write_artifacts(inputs, solution, options, report, directory, name=name, on_progress=exported)
     exported(1.0)
-    return _finished(solution, metrics, artifacts, camera_sentence=report["camera"]["sentence"])
+    done = _finished(solution, metrics, artifacts, camera_sentence=report["camera"]["sentence"])
+    return replace(done, warnings=(*done.warnings, *of_files))
 
 
 def _finished(

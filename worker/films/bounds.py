@@ -9,6 +9,10 @@ if TYPE_CHECKING:
     from pliant.worker.settings import Settings
 
 
+LONGEST = 604_800.0
+"""Seconds of tracking where nothing else limits a job's time: one week, the largest `time_limit` of a job."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilmBounds:
     """Limits on one film; `pliant.tracking.FilmLimits` enforces those on file size, frames, pixels and playing time."""
@@ -28,7 +32,7 @@ class FilmBounds:
     check_seconds: float = 30.0
     """Wall time of the check at submission, seconds."""
 
-    track_seconds: float = 3600.0
+    track_seconds: float = LONGEST
     """Wall time of tracking, seconds."""
 
     memory: int = 4 << 30
@@ -39,9 +43,9 @@ class FilmBounds:
 
     @classmethod
     def of(cls, settings: Settings, *, max_bytes: int = 1 << 30) -> FilmBounds:
-        """Return the bounds of an installation; the memory limit of jobs also applies to the film process."""
+        """Return the bounds of an installation; the memory and time limits of jobs also apply to the film process."""
         memory = min(settings.film_memory, settings.memory_limit or settings.film_memory)
         return cls(
             max_bytes=max_bytes, max_frames=settings.film_frames, max_pixels=settings.film_pixels,
-            max_seconds=settings.film_seconds, memory=memory,
+            max_seconds=settings.film_seconds, track_seconds=settings.time_limit or LONGEST, memory=memory,
         )  # fmt: skip

@@ -69,25 +69,32 @@ MICROSECONDS = 8.0
 def estimated(num_frames: int, num_points: int, options: Options, *, has_rotations: bool = False) -> Estimate:
     """Estimate what a job of this size needs; `has_rotations` is true if the cameras are given."""
     observations = num_frames * num_points
-    learns = options.prior == "gaussian" and options.method == "robust" and options.preset == "auto"
+    prior = _prior(options)
+    learns = prior == "gaussian"
     at_once = int(min(observations, _largest_block(options)))
     used = num_frames if options.order == "any" else learned_frames(num_frames)
     learning = LEARNING[learns, has_rotations] * used
     if learns and _may_be_perspective(options):
         learning *= LENS
     return Estimate(
-        memory_bytes=LIBRARIES + BYTES[options.prior] * at_once + BEYOND * (observations - at_once),
+        memory_bytes=LIBRARIES + BYTES[prior] * at_once + BEYOND * (observations - at_once),
         seconds=round(SECONDS + learning + MICROSECONDS * 1e-6 * observations, 1),
     )
 
 
 def largest_that_fits(memory: int, num_frames: int, num_points: int, options: Options) -> tuple[int, int]:
     """Return the most points at this number of frames, and the most frames at this number of points, that fit into `memory` bytes."""
-    left, each, block = max(0, memory - LIBRARIES), BYTES[options.prior], _largest_block(options)
+    left, each, block = max(0, memory - LIBRARIES), BYTES[_prior(options)], _largest_block(options)
     observations = left // each
     if observations > block:
         observations = int(block + (left - each * block) // BEYOND)
     return observations // max(1, num_frames), observations // max(1, num_points)
+
+
+def _prior(options: Options) -> str:
+    """Return the prior that a job uses: the Gaussian one is learned only by the default method and preset."""
+    learned = options.method == "robust" and options.preset == "auto"
+    return "smooth" if options.prior == "gaussian" and not learned else options.prior
 
 
 def _may_be_perspective(options: Options) -> bool:

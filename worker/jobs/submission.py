@@ -27,6 +27,21 @@ def order_waiting(records: Records, queue: Queue, owners: Collection[str]) -> No
         queue.order({each.attempt_id: RANKS[each.priority] for each in beats if each.owner == owner})
 
 
+def push_or_hold(stored: Stored, records: Records, queue: Queue, settings: Settings) -> bool:
+    """Queue a stored job, or hold it back until its owner has fewer running jobs; return whether it was queued.
+
+    The reconciler queues jobs that are held back. Jobs are counted after the record is written, so that simultaneous submissions
+    count each other.
+    """
+    most = settings.max_running if stored.max_running is None else stored.max_running
+    unfinished = (Status.QUEUED, Status.RUNNING, Status.CANCELLING)
+    if 0 < most < records.count(unfinished, owner=stored.owner):
+        queue.hold(stored.attempt_id)
+        return False
+    queue.push(stored.job.id, stored.attempt_id)
+    return True
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Submission:
     """A client's request, without the input files."""
@@ -96,27 +111,14 @@ class Acceptance:
             self.blobs.delete(folder_of(stored.inputs))
             return kept
         try:
-            if self._over_running_limit(stored):
-                self.queue.hold(stored.attempt_id)
-            else:
-                self.queue.push(stored.job.id, stored.attempt_id)
-                if stored.job.priority != "normal":
-                    order_waiting(self.records, self.queue, [stored.owner])
+            if push_or_hold(stored, self.records, self.queue, self.settings) and stored.job.priority != "normal":
+                order_waiting(self.records, self.queue, [stored.owner])
         except StoreUnavailable:
             return kept  # the record is stored, and the reconciler adds the missing queue entry
         return kept
 
     def _uploaded(self) -> int:
         return open_uploads(self.settings, self.blobs).used()
-
-    def _over_running_limit(self, stored: Stored) -> bool:
-        """Return whether to hold the new job back until its owner has fewer running jobs; the reconciler then queues it.
-
-        Jobs are counted after the record is written, so that simultaneous submissions count each other.
-        """
-        most = self.settings.max_running if stored.max_running is None else stored.max_running
-        unfinished = (Status.QUEUED, Status.RUNNING, Status.CANCELLING)
-        return most > 0 and self.records.count(unfinished, owner=stored.owner) > most
 
 
 def folder_of(inputs: str) -> str:

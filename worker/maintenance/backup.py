@@ -30,7 +30,7 @@ from pliant.worker.execution.failures import worker_lost
 from pliant.worker.ids import new_attempt_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
-from pliant.worker.jobs.submission import order_waiting
+from pliant.worker.jobs.submission import order_waiting, push_or_hold
 from pliant.worker.records import Stored, utc_now
 from pliant.worker.settings import Settings
 from pliant.worker.store.schema import CURRENT, prepare
@@ -122,7 +122,7 @@ def restore_backup(settings: Settings, source: Path) -> Summary:
     owners = []
     for line in _lines(records):
         stored = snapshot.write(json.loads(line))
-        _queue_again(jobs, stored)
+        _requeue(jobs, stored)
         owners.append(stored.owner)
     order_waiting(jobs.records, jobs.queue, set(owners))
     sizes = manifest["blobs"].values()
@@ -159,8 +159,8 @@ def _media_types(records: Path) -> dict[str, str]:
     return {f"{each['prefix']}{one['name']}": one["media_type"] for each in held for one in each["job"]["artifacts"]}
 
 
-def _queue_again(jobs: Jobs, stored: Stored) -> None:
-    """Queue a restored job that has not ended."""
+def _requeue(jobs: Jobs, stored: Stored) -> None:
+    """Queue a restored job that has not ended, or hold it back where its owner has reached the limit of running jobs."""
     if stored.job.status in lifecycle.ACTIVE:
         change = partial(
             lifecycle.requeue, attempt_id=stored.attempt_id, fresh=new_attempt_id(stored.job.id), max_attempts=None,
@@ -170,7 +170,7 @@ def _queue_again(jobs: Jobs, stored: Stored) -> None:
         with suppress(StaleAttempt):
             stored = jobs.records.update(stored.job.id, change)
     if stored.job.status is Status.QUEUED:
-        jobs.queue.push(stored.job.id, stored.attempt_id)
+        push_or_hold(stored, jobs.records, jobs.queue, jobs.settings)
 
 
 def read_manifest(source: Path) -> dict[str, Any]:

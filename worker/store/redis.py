@@ -49,7 +49,7 @@ _CREATE = """
 local at = ARGV[1]
 if ARGV[9] ~= '' then
   local taken = redis.call('GET', at .. 'key:' .. ARGV[9])
-  if taken then return taken end
+  if taken and redis.call('EXISTS', at .. 'job:' .. taken) == 1 then return taken end
 end
 if redis.call('EXISTS', at .. 'job:' .. ARGV[2]) == 1 then return ARGV[2] end
 local most = tonumber(ARGV[14])
@@ -155,7 +155,12 @@ class RedisRecords(Records):
             raise TooManyQueued(max_queued)
         if taken == _NO_SPACE:
             raise QuotaExceeded(used=self.used(), quota=max_bytes)
-        return stored if taken is None else self.get(str(taken))
+        if taken is None:
+            return stored
+        try:
+            return self.get(str(taken))
+        except UnknownJob:  # deleted in between, so that the key is free
+            return self.create(stored, max_queued=max_queued, max_bytes=max_bytes)
 
     def get(self, id: str) -> Stored:
         with reachable():
@@ -167,7 +172,10 @@ class RedisRecords(Records):
     def find(self, key: str) -> Stored | None:
         with reachable():
             id = self._redis.get(f"{self._at}key:{key}")
-        return None if id is None else self.get(id)
+        try:
+            return None if id is None else self.get(id)
+        except UnknownJob:  # deleted in between
+            return None
 
     def replace(self, before: Stored, after: Stored) -> bool:
         name, data = event_of(before, after)

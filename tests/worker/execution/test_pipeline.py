@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from pliant.schemas.options import SOLVER_FIELDS, Options
 from pliant.solver import InvalidInput, KnownCamera, Mesh, Outcome, Settings, solve
 from pliant.solver.evaluation.metrics import e3d_frame
 from pliant.solver.shapes.irls import MAX_INNER
+from pliant.worker.artifacts.result import file_warnings
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.failures import problem_of
 from pliant.worker.execution.pipeline import reconstruct
@@ -54,6 +56,24 @@ def test_the_files_match_the_returned_results(inputs: Inputs, tmp_path: Path) ->
     fractions = [each.fraction for each in steps]
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1
+
+
+def test_options_without_effect_on_the_files_are_reported(inputs: Inputs, tmp_path: Path) -> None:
+    finished = reconstruct(inputs, CHEAP.model_copy(update={"colours": "expected_error"}), tmp_path)
+    sentence = "colours=expected_error has no effect, because the solution has no expected error."
+    assert finished.warnings.count(sentence) == 1
+    assert json.loads((tmp_path / "report.json").read_text())["warnings"] == list(finished.warnings)
+    plain = reconstruct(inputs, CHEAP.model_copy(update={"colours": "error", "glb_motion": "frames"}), tmp_path)
+    assert not any("no effect" in each for each in plain.warnings)
+
+
+def test_more_frames_than_morph_targets_are_reported() -> None:
+    few, many = (SimpleNamespace(shapes=np.zeros((frames, 1, 3)), shapes_std=None) for frames in (200, 201))
+    options = Options(glb_motion="frames", outputs=("glb",))
+    assert file_warnings(options, few) == ()  # type: ignore[arg-type]
+    (sentence,) = file_warnings(options, many)  # type: ignore[arg-type]
+    assert sentence.startswith("glb_motion=frames has no effect")
+    assert file_warnings(Options(glb_motion="frames", outputs=("ply",)), many) == ()  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("stage", ["loading", "cameras", "initialise", "reweight", "exporting"])

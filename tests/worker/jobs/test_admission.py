@@ -60,6 +60,14 @@ def test_the_memory_estimate_is_within_a_factor_of_two_of_a_real_job(frames: int
     assert peak / 2 < estimate < 2 * peak, (peak, estimate)
 
 
+@pytest.mark.parametrize("other", [{"method": "temporal"}, {"preset": "paper"}])
+def test_the_estimate_without_a_learned_prior_is_that_of_the_smooth_prior(other: dict[str, Any]) -> None:
+    assert estimated(100, 10_000, Options(**other)) == estimated(100, 10_000, Options(prior="smooth"))
+    assert largest_that_fits(10**9, 100, 10_000, Options(**other)) == largest_that_fits(
+        10**9, 100, 10_000, Options(prior="smooth")
+    )
+
+
 def test_the_largest_job_that_fits_just_meets_the_memory_limit() -> None:
     for prior in ("gaussian", "smooth", "smooth+low_rank"):
         options = Options(prior=prior)

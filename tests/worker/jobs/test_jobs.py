@@ -23,9 +23,10 @@ from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.finished import Finished
 from pliant.worker.jobs.retry import retry
 from pliant.worker.jobs.service import Jobs
-from pliant.worker.jobs.submission import Submission
-from pliant.worker.records import Stored
+from pliant.worker.jobs.submission import Submission, key_digest
+from pliant.worker.records import Stored, utc_now
 from pliant.worker.store.blobs import Blobs
+from pliant.worker.store.redis import RedisRecords
 from pliant.worker.uploads.service import Capacity, Uploads
 
 NOW = datetime(2030, 1, 2, tzinfo=UTC)
@@ -128,6 +129,27 @@ def test_a_repeated_request_returns_the_first_job(jobs: Jobs, submit) -> None:  
     assert submit(jobs.of("ann"), idempotency_key="k", fingerprint="f").id != first.id, "keys are the owner's own"
     assert len(jobs.queue.waiting()) == 2
     assert len(blob_names(jobs)) == 2
+
+
+def test_a_request_whose_first_job_is_deleted_meanwhile_creates_a_new_job(
+    jobs: Jobs, submit, monkeypatch: pytest.MonkeyPatch
+) -> None:  # type: ignore[no-untyped-def]
+    first = submit(idempotency_key="k", fingerprint="f")
+    read = jobs.records.get
+
+    def deleted_before(id: str) -> Stored:
+        monkeypatch.setattr(type(jobs.records), "get", staticmethod(read))
+        jobs.records.delete(read(id), at=utc_now())
+        return read(id)
+
+    monkeypatch.setattr(type(jobs.records), "get", staticmethod(deleted_before))
+    key = key_digest("k", None)
+    assert key is not None
+    if isinstance(jobs.records, RedisRecords):
+        assert jobs.records.find(key) is None
+    else:
+        jobs.records.delete(read(first.id), at=utc_now())
+    assert submit(idempotency_key="k", fingerprint="f").id != first.id
 
 
 def test_a_chosen_id_can_be_used_only_once(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]

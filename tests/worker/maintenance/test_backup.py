@@ -106,6 +106,17 @@ def test_restore_recovers_the_installation(jobs: Jobs, sent: dict[str, str], emp
     assert there.records.tallies()["ended:succeeded"] == 1
 
 
+def test_restore_observes_the_limit_of_running_jobs(
+    jobs: Jobs, submit: Submit, empty: Settings, tmp_path: Path
+) -> None:
+    for _ in range(3):
+        submit()
+    write_backup(jobs.settings, tmp_path / "backup")
+    restore_backup(replace(empty, max_running=1), tmp_path / "backup")
+    there = Jobs.open(empty)
+    assert (len(there.queue.waiting()), len(there.queue.held())) == (1, 2)
+
+
 def test_a_further_outputs_job_keeps_its_source_result_in_a_backup(
     jobs: Jobs, submit: Submit, empty: Settings, tmp_path: Path
 ) -> None:
