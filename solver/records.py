@@ -122,7 +122,7 @@ class Camera:
     """φ, focal length, the tracks' unit; None: orthographic."""
 
     focal_std: float | None = None
-    """Standard deviation of an estimated φ; 0 for a given one, None for orthographic cameras and where an isometric surface gave φ."""
+    """Standard deviation of an estimated φ; 0 for a given one, None for orthographic cameras and where there is no estimate."""
 
     principal_point: Floats = field(default_factory=lambda: np.zeros(2))
     """c, shape `(2,)`, the tracks' unit; has no effect for orthographic cameras."""

@@ -83,8 +83,8 @@ class Perspective:
     curvature: float = 0.0
     """κ = 1/φ, inverse normalized units; 0: orthography. Its final sign is `signs[0]`: positive if the third axis points away."""
 
-    curvature_std: float = 0.0
-    """Standard deviation of κ; 0 if κ is given or at the end of the range compared."""
+    curvature_std: float | None = None
+    """Standard deviation of κ; None if κ is given, or no values on both sides of it were compared."""
 
     given: float | None = None
     """κ of a given focal length; None if none is given."""
@@ -117,6 +117,12 @@ class Perspective:
     def bends(self) -> bool:
         """Whether the tracks are corrected for perspective."""
         return self.curvature != 0
+
+    def focal_std(self, unit: float) -> float | None:
+        """Return the standard deviation of φ, 0 if φ is given, None if unknown; a normalized unit is `unit` of the result."""
+        if self.given is not None:
+            return 0.0
+        return None if self.curvature_std is None else unit * self.curvature_std / self.curvature**2
 
 
 def depth_map(rotations: Floats, scales: Floats, covariance: ShapeCovariance) -> Floats | DepthMap:

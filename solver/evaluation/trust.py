@@ -13,8 +13,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats
+from pliant.solver.tracks.frame_selection import informative_frames
 
 INTERVAL = (0.35, 3.6)
 """Ends of the interval for the error, relative to the expected error: about the 10 and 90 % quantiles of true over expected error on the
@@ -124,6 +126,7 @@ def assess(
     planar: bool = False,
     modes: int = 0,
     depth_is_typical: bool = False,
+    behind: NDArray[np.bool_] | None = None,
 ) -> Trust:
     """Return the verdict on a result.
 
@@ -151,6 +154,8 @@ def assess(
         Number of modes of deformation of the prior.
     depth_is_typical : bool
         Whether a prior, not the tracks, determines the extent of depth.
+    behind : ndarray of bool, shape (F,), optional
+        Frames in which points lie behind the camera; None for none.
     """
     size = size_of(shapes)
     pulse()
@@ -161,7 +166,8 @@ def assess(
     relative = (residuals / scales[:, None])[seen]
     pulse()
     residual = float(np.median(relative)) / size if relative.size else np.inf
-    turn = turned(rotations)
+    shown = informative_frames(visible)
+    turn = turned(rotations[shown])
     hidden = 1.0 - float(seen.mean())
     unseen = f"{hidden:.0%} of the positions are hidden and interpolated from their surroundings."
     found = [
@@ -169,6 +175,13 @@ def assess(
         _sign(-turn, -NARROW, -STILL, f"The camera turned by only {turn:.0f}°; depth needs {NARROW:.0f}° or more."),
         _sign(hidden, HIDDEN_SHARE, UNSEEN_SHARE, unseen),
     ]
+    if behind is not None and behind.any():
+        which = _frames(behind, ordered=ordered)
+        found.append((Verdict.DO_NOT_USE, f"In {which}, points of the shape lie behind the camera."))
+    if not shown.all():
+        which = _frames(~shown, ordered=ordered)
+        sentence = f"Hardly a point is visible in {which}: the shapes there are guesses. Keep the object in the picture, or leave them out."
+        found.append((Verdict.WITH_CARE, sentence))
     if expected is not None:
         upper = INTERVAL[1] * expected
         large = f"may be as large as {_share(upper)}" if bounded else f"is expected to be at least {_share(expected)}"
@@ -188,6 +201,13 @@ def assess(
         verdict, tuple(sentence for _, sentence in signs), expected, interval, turn, residual, hidden,
         held_out_error, turning, deforming,
     )  # fmt: skip
+
+
+def _frames(chosen: NDArray[np.bool_], *, ordered: bool) -> str:
+    """Return how many frames are chosen and, in a film, which is the first."""
+    count = int(chosen.sum())
+    first = f" (the first is frame {int(np.argmax(chosen))})" if ordered else ""
+    return f"{count} of {len(chosen)} frames{first}"
 
 
 def _untold(turning: float, deforming: float) -> list[tuple[Verdict, str]]:

@@ -68,11 +68,11 @@ def described(view: Perspective, unit: float) -> str:
         )
     compared = [each for each in nll if each != 0 and (view.given is None or abs(each) == view.given)]
     own = min((nll[each] for each in compared), default=nll[0.0])
-    how = (
-        "as given" if view.given is not None else f"± {float(f'{unit * view.curvature_std / view.curvature**2:.2g}'):g}"
-    )
+    std = view.focal_std(unit)
+    how = "as given" if view.given is not None else "" if std is None else f"± {float(f'{std:.2g}'):g}"
     gains = f"gains {nll[0.0] - own:.3f} in the log likelihood per point and frame over orthography"
-    return f"Perspective with focal length {unit / abs(view.curvature):.4g} {how}: {gains if own < UNLIKELY else DIVERGED}."
+    length = f"{unit / abs(view.curvature):.4g} {how}".strip()
+    return f"Perspective with focal length {length}: {gains if own < UNLIKELY else DIVERGED}."
 
 
 def improbable(view: Perspective, unit: float) -> str | None:

@@ -216,8 +216,7 @@ def camera_of(estimate: CameraEstimate, observations: Observations) -> Camera:
         camera = replace(camera, principal_point=np.array(view.principal_point), y_up=view.signs[0] < 0)
     if view is not None and view.bends:
         focal = normalized.unit / abs(view.curvature)
-        std = 0.0 if view.given is not None else focal * view.curvature_std / abs(view.curvature)
-        camera = replace(camera, focal=focal, focal_std=std)
+        camera = replace(camera, focal=focal, focal_std=view.focal_std(normalized.unit))
     for array in (camera.rotations, camera.scales, camera.translations, camera.principal_point):
         read_only(array)
     return camera

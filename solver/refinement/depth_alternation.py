@@ -12,9 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.cameras.aimed import Aimed, towards
 from pliant.solver.cameras.factorization import upgrades
 from pliant.solver.cameras.multistart import CANDIDATES
-from pliant.solver.cameras.perspective import Perspective, corrected, depth_map, depths_of
+from pliant.solver.cameras.perspective import Perspective, centred, columns, corrected, depths_of
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.so3 import MIRROR, nearest
 from pliant.solver.records import Floats
@@ -73,7 +74,7 @@ def alternated(
 
 
 def factorized_again(
-    gram: Floats,
+    scales: Floats,
     view: Perspective,
     found: Learned,
     used: NDArray[np.intp],
@@ -85,10 +86,10 @@ def factorized_again(
 
     Parameters
     ----------
-    gram : array, shape (2F, 2F)
-        W Wᵀ / P of the corrected tracks, divided by the scales.
+    scales : array, shape (F,)
+        Scales by which the corrected tracks are divided.
     view : Perspective
-        κ, and the sample at all frames.
+        κ, and the sample and the depth map of all frames.
     found : Learned
         Cameras and covariance, at the frames used. The factorizations are aligned to their world axes and sign of depth.
     used : array of int, shape (F',)
@@ -109,16 +110,27 @@ def factorized_again(
         moved, _ = alternated(view, start, some, model_order=model_order, turning=True, rounds=1)
         return moved.energy
 
+    turns = towards(view.sample.mean(axis=1), view.curvature)
+    rows = columns(_turned(view, turns) / scales[:, None, None])
+    gram = rows @ rows.T / rows.shape[1]
     limit = min(len(gram) // 3, view.sample.shape[1] // 3)
     best, lowest = None, energy(part)
     for each in upgrades(gram, [size for size in CANDIDATES if size <= limit]):
         if should_stop is not None and should_stop():
             break
-        rotations = aligned(each.rotations, found.rotations, used)
+        rotations = turns.transpose(0, 2, 1) @ aligned(each.rotations, turns[used] @ found.rotations, used)
         reached = energy(replace(part, rotations=rotations[some]))
         if reached < lowest:
             best, lowest = rotations, reached
     return best
+
+
+def _turned(view: Perspective, turns: Floats) -> Floats:
+    """Return the corrected and centred tracks of the sample, `(F, S, 2)`, seen by turned cameras."""
+    depths = depths_of(view.depth, view.sample, view.curvature)
+    images = centred(corrected(view.sample, depths, view.curvature))
+    depths -= depths.mean(axis=1, keepdims=True)
+    return np.asarray(images @ turns[:, :2, :2].transpose(0, 2, 1) + depths[..., None] * turns[:, None, :2, 2])
 
 
 def aligned(rotations: Floats, like: Floats, used: NDArray[np.intp]) -> Floats:
@@ -131,11 +143,12 @@ def aligned(rotations: Floats, like: Floats, used: NDArray[np.intp]) -> Floats:
 
 
 def _relearned(view: Perspective, found: Learned, used: NDArray[np.intp], model_order: ModelOrder) -> Learned:
-    views = view.sample[used]
-    depths = depths_of(depth_map(found.rotations, found.scales, found.covariance), views, view.curvature)
+    aimed = Aimed.of(view.sample[used], view.curvature)
+    rotations = aimed.turned(found.rotations)
+    depth = aimed.depth_map(rotations, found.scales, found.covariance)
     again = annealed_at(
-        corrected(views, depths, view.curvature), found.rotations, found.scales, model_order,
-        iterations=ALTERNATION_EM_ROUNDS,
+        corrected(aimed.views, depths_of(depth, aimed.views, view.curvature), view.curvature), rotations, found.scales,
+        model_order, iterations=ALTERNATION_EM_ROUNDS,
     )  # fmt: skip
     return replace(found, covariance=again.covariance)
 

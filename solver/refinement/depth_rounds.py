@@ -121,13 +121,11 @@ def _restarted(
 
     `found` holds the estimate's cameras and covariance at the frames used, and is returned refined.
     """
-    wide = np.repeat(np.asarray(estimate.scales), 2)
+    scales = np.asarray(estimate.scales)
     for _ in range(RESTARTS):
         view = estimate.perspective
         assert view is not None
-        rotations = factorized_again(
-            estimate.gram / np.outer(wide, wide), view, found, used, model_order=model_order, should_stop=should_stop
-        )
+        rotations = factorized_again(scales, view, found, used, model_order=model_order, should_stop=should_stop)
         if rotations is None:
             break
         start = replace(found, rotations=rotations[used])
@@ -176,7 +174,7 @@ def with_stretched_depth(
     """
     view = estimate.perspective
     assert view is not None
-    curvature, std = view.curvature / stretch, view.curvature_std / stretch
+    curvature, std = view.curvature / stretch, (view.curvature_std or 0.0) / stretch
     view = replace(view, curvature=curvature, curvature_std=float(np.hypot(std, LOG_DEPTH_STD * curvature)))
     return _applied(estimate, normalized, used, replace(found, scales=found.scales * scales), view)
 

@@ -21,13 +21,14 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.cameras.aimed import Aimed, towards
 from pliant.solver.cameras.perspective import (
     Candidate,
     Perspective,
     centred,
     columns,
+    corrected,
     density,
-    depth_map,
     depths_of,
 )
 from pliant.solver.model.image_density import factor_of
@@ -174,6 +175,10 @@ class _Comparison:
         """Return the trial of κ with depths, cameras and covariance refined from those of `trial`."""
         found = trial.found
         zooms = bool((found.scales != 1).any())
+        if self.turning:
+            middle = self.views.mean(axis=1)
+            turns = towards(middle, curvature).transpose(0, 2, 1) @ towards(middle, trial.curvature)
+            found = replace(found, rotations=turns @ found.rotations)
         try:
             found, _ = refined_with_focal(
                 self.views,
@@ -273,7 +278,7 @@ def _decided(view: Perspective, trials: dict[float, _Trial], frames: int, points
     needed = trials[0.0].nll - nll > max(MIN_PERSPECTIVE_GAIN, MIN_TOTAL_GAIN / (frames * points)) and settled
     if not (needed or view.required or view.given is not None):
         return replace(view, curvature=0.0, candidates=candidates)
-    std, found = 0.0, _around(trials)
+    std, found = None, _around(trials)
     if view.given is None and found is not None:
         bend = max(_parabola(*found)[1], 1e-12)
         std = float(1 / np.sqrt(bend * frames * min(points, 1 / CAMERA_PRIOR_WEIGHT)))
@@ -309,9 +314,9 @@ def refined_with_focal(
     iterations : int
         L-BFGS iterations.
     """
-    depths = depths_of(depth_map(found.rotations, found.scales, found.covariance), views, curvature)
-    energy = corrected_energy(views, depths, found, with_scales=with_scales)
-    motion = motion_of(energy.scene, found)
+    start = replace(found, rotations=Aimed.of(views, curvature).turned(found.rotations))
+    energy = corrected_energy(views, curvature, start, with_scales=with_scales)
+    motion = motion_of(energy.scene, start)
     held = 0 if turning else 3 * len(views)
     given = np.append(motion.flat(), curvature)
 
@@ -324,17 +329,25 @@ def refined_with_focal(
         objective, given[held:], jac=True, method="L-BFGS-B", options={"maxiter": iterations, "maxcor": 20}
     )
     flat = np.concatenate([given[:held], np.asarray(result.x)])
-    moved = Motion.unflat(flat[:-1], len(views))
-    return moved_to(energy.scene, found, moved, float(result.fun)), float(flat[-1])
+    moved = moved_to(energy.scene, start, Motion.unflat(flat[:-1], len(views)), float(result.fun))
+    turns = towards(views.mean(axis=1), float(flat[-1]))
+    rotations = turns.transpose(0, 2, 1) @ moved.rotations if turning else found.rotations
+    return replace(moved, rotations=rotations), float(flat[-1])
 
 
 class corrected_energy:  # noqa: N801
-    """E of tracks corrected with fixed depths, as a function of the likelihood's parameters, followed by κ."""
+    """E of tracks corrected with fixed depths, as a function of the likelihood's parameters, followed by κ.
 
-    def __init__(self, views: Floats, depths: Floats, found: Learned, *, with_scales: bool) -> None:
+    The tracks are turned towards the object (`cameras.aimed`), and linear in the change of κ. `found` has cameras that are turned likewise.
+    """
+
+    def __init__(self, views: Floats, curvature: float, found: Learned, *, with_scales: bool) -> None:
         count = views.shape[1]
-        plain, along = columns(centred(views)), columns(centred(views * depths[..., None]))
-        self.depths = depths
+        aimed, slope, self.density_slope = Aimed.with_slopes(views, curvature)
+        depths = depths_of(aimed.depth_map(found.rotations, found.scales, found.covariance), aimed.views, curvature)
+        changed = slope * (1 + curvature * depths)[..., None] + aimed.views * depths[..., None]
+        plain, along = columns(centred(corrected(aimed.views, depths, curvature))), columns(centred(changed))
+        self.depths, self.curvature, self.density = depths, curvature, aimed.density
         self.grams = (plain @ plain.T / count, (plain @ along.T + along @ plain.T) / count, along @ along.T / count)
         self.scene = scene_at(self.grams[0], found.rotations, with_scales=with_scales, ordered=found.covariance.ordered)
 
@@ -342,14 +355,15 @@ class corrected_energy:  # noqa: N801
         """Return E and its gradient."""
         frames, curvature = len(self.depths), float(flat[-1])
         constant, linear, square = self.grams
-        nearer = 1 + curvature * self.depths
+        nearer, more = 1 + curvature * self.depths, curvature - self.curvature
         if nearer.min() < MIN_RELATIVE_DISTANCE:
             return UNLIKELY, np.zeros_like(flat)
-        gram = constant + curvature * linear + curvature**2 * square
+        gram = constant + more * linear + more**2 * square
         scene = replace(self.scene, gram=gram, factor=factor_of(gram))
         value, gradient, inverse = energy_with_inverse(scene, Motion.unflat(flat[:-1], frames))
         if inverse is None:
             return value, np.zeros_like(flat)
-        slope = 0.5 * float(np.vdot(inverse, linear + 2 * curvature * square)) / frames
-        slope -= 2 * float((self.depths / nearer).mean())
-        return value + density(self.depths, curvature), np.append(gradient.flat(), slope)
+        slope = 0.5 * float(np.vdot(inverse, linear + 2 * more * square)) / frames
+        slope += self.density_slope - 2 * float((self.depths / nearer).mean())
+        value += density(self.depths, curvature) + self.density + more * self.density_slope
+        return value, np.append(gradient.flat(), slope)

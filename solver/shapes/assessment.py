@@ -6,12 +6,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.planar_ambiguity import is_planar, on_one_line
 from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.evaluation.trust import Trust, assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.records import Floats, Tracks, read_only
+from pliant.solver.records import Camera, Floats, Tracks, read_only
 from pliant.solver.shapes.held_out import held_out_error
 from pliant.solver.shapes.jackknife import Changes, learning_changes
 from pliant.solver.shapes.uncertainty import Pinhole, bounded_by_neighbours, position_std
@@ -119,4 +120,12 @@ def judged(
         planar=is_planar(estimate.gram) or on_one_line(tracks),
         modes=0 if covariance is None else covariance.modes.shape[1],
         depth_is_typical=estimate.depth_is_typical,
+        behind=frames_behind(solution.camera, solution.shapes),
     )
+
+
+def frames_behind(camera: Camera, shapes: Floats) -> NDArray[np.bool_]:
+    """Return a mask of the frames in which points lie behind a perspective camera, shape `(F,)`."""
+    if camera.focal is None:
+        return np.zeros(len(shapes), dtype=bool)
+    return np.asarray(camera.depths(shapes).min(axis=1) <= -camera.focal)

@@ -74,9 +74,8 @@ def seen_in_perspective(
         nearer = 1 - camera.depths(solution.shapes)[:, kept].mean(axis=1) / focal
         scales = scales / nearer
         translations = camera.principal_point + (translations - camera.principal_point) / nearer[:, None]
-    std = 0.0 if view.given is not None else focal * view.curvature_std / abs(view.curvature)
     camera = Camera(
-        camera.rotations, scales, translations, focal, std, camera.principal_point, camera.y_up
+        camera.rotations, scales, translations, focal, view.focal_std(unit), camera.principal_point, camera.y_up
     )  # fmt: skip
     left = tracks.points - camera.project(solution.shapes)
     residuals: Floats = np.where(tracks.visible > 0, np.hypot(left[..., 0], left[..., 1]), 0.0)

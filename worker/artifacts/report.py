@@ -74,7 +74,8 @@ def described_camera(solution: Solution, options: Options) -> dict[str, Any]:
     if camera.focal is not None and options.image_size is not None:
         half = float(options.image_size.split("x")[0]) / 2
         angle = math.degrees(2 * math.atan2(half, camera.focal))
-        angle_std = math.degrees(2 * half / (camera.focal**2 + half**2)) * (camera.focal_std or 0.0)
+        if camera.focal_std is not None:
+            angle_std = math.degrees(2 * half / (camera.focal**2 + half**2)) * camera.focal_std
     return {
         "model": choices.camera,
         "focal": camera.focal,

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from pliant.solver import KnownCamera, Settings, Tracks, gallery, solve
+from pliant.solver import Camera, KnownCamera, Settings, Tracks, gallery, solve
 from pliant.solver.evaluation.metrics import e3d_frame
 from pliant.solver.evaluation.trust import Verdict, assess, per_frame, turned
+from pliant.solver.shapes.assessment import frames_behind
 from scipy.spatial.transform import Rotation
 
 FRAMES, POINTS = 12, 30
@@ -26,6 +28,20 @@ def judged(**changed: Any) -> Any:
         "shapes_std": np.full((FRAMES, POINTS), 0.02),
     }
     return assess(shapes, rotations, **{**given, **changed})
+
+
+def test_frames_that_show_nothing_do_not_count_as_turn() -> None:
+    visible = np.where(np.arange(FRAMES)[:, None] < 7, 1.0, 0.0) * np.ones(POINTS)
+    assert judged(visible=visible).turn_degrees == pytest.approx(60 * 6 / 11)
+
+
+def test_points_behind_a_pinhole_camera_are_found() -> None:
+    camera = Camera(np.tile(np.eye(3), (3, 1, 1)), np.array([1.0, 1.0, 2.0]), np.zeros((3, 2)), focal=4.0)
+    shapes = np.zeros((3, 4, 3))
+    shapes[:, 0, 2] = -3.0
+    assert frames_behind(camera, shapes).tolist() == [False, False, True]
+    assert frames_behind(replace(camera, y_up=True), -shapes).tolist() == [False, False, True]
+    assert not frames_behind(replace(camera, focal=None), shapes).any()
 
 
 def test_a_result_without_reasons_against_it_is_good() -> None:
@@ -56,6 +72,17 @@ def test_a_result_without_reasons_against_it_is_good() -> None:
             "may be as large as 200 % of the object's size",
         ),
         ({"visible": np.eye(FRAMES, POINTS) + np.eye(FRAMES, POINTS, 12)}, Verdict.DO_NOT_USE, "are hidden"),
+        (
+            {"behind": np.arange(FRAMES) > 9},
+            Verdict.DO_NOT_USE,
+            "In 2 of 12 frames (the first is frame 10), points of the shape lie behind the camera.",
+        ),
+        (
+            {"visible": np.where(np.arange(FRAMES)[:, None] < 7, 1.0, 0.0) * np.ones(POINTS)},
+            Verdict.WITH_CARE,
+            "Hardly a point is visible in 5 of 12 frames (the first is frame 7)",
+        ),
+        ({"behind": np.arange(FRAMES) > 9, "ordered": False}, Verdict.DO_NOT_USE, "In 2 of 12 frames, points"),
         ({"planar": True}, Verdict.WITH_CARE, "A thin sheet, 45 % of its size off its plane"),
         ({"depth_is_typical": True}, Verdict.WITH_CARE, "With 60° of turn the tracks hardly determine"),
         ({"modes": 7}, Verdict.WITH_CARE, "7 modes of deformation in 12 frames"),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pliant.solver import Settings, Tracks, gallery, solve
-from pliant.solver.cameras.perspective import MIRROR, Perspective, centred, columns
+from pliant.solver.cameras.perspective import MIRROR, Perspective, centred, columns, depth_map
 from pliant.solver.evaluation.metrics import e3d_frame_scaled
 from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.model_order import ModelOrder
@@ -55,10 +55,13 @@ def test_a_new_factorization_corrects_cameras_that_are_off(
     start = Learned(given, np.ones(12), annealed(gram, given[:, :2], iterations=30), np.inf)
     used = np.arange(12)
     found, moved = alternated(view, start, used, model_order=ModelOrder(), turning=True)
-    better = factorized_again(gram, moved, found, used, model_order=ModelOrder())
+    moved = replace(moved, depth=depth_map(found.rotations, found.scales, found.covariance))
+    better = factorized_again(found.scales, moved, found, used, model_order=ModelOrder())
     turned = found.rotations if better is None else better
     assert np.degrees(angles_between(aligned(turned, rotations, used), rotations)).max() < 0.5
-    assert factorized_again(gram, moved, found, used, model_order=ModelOrder(), should_stop=lambda: True) is None
+    assert (
+        factorized_again(found.scales, moved, found, used, model_order=ModelOrder(), should_stop=lambda: True) is None
+    )
 
 
 def test_a_round_that_leads_to_extreme_depths_is_discarded(

@@ -1,0 +1,109 @@
+"""Cameras turned towards the object: the images of turned pinhole cameras, whose corrected tracks are scaled-orthographic."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pliant.solver import Settings, Tracks, gallery, solve
+from pliant.solver.cameras.aimed import Aimed, towards
+from pliant.solver.cameras.perspective import centred, corrected
+from pliant.solver.evaluation.metrics import e3d_frame_scaled, focal_error
+from pliant.solver.model.so3 import MIRROR
+
+FRAMES, POINTS = 5, 30
+CURVATURES = pytest.mark.parametrize("curvature", [0.25, -0.25])
+PICTURE = (1280.0, 720.0)
+
+
+def scene(curvature: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points `(F, P, 3)` before a camera with κ = `curvature` at a depth of 1/κ, off the axis, and their images."""
+    random = np.random.default_rng(3)
+    points = 0.6 * random.normal(size=(FRAMES, POINTS, 3)) + [0, 0, 1 / abs(curvature)]
+    points[..., :2] += random.uniform(-1.5, 1.5, (FRAMES, 1, 2))
+    views = points[..., :2] / points[..., 2:] / abs(curvature)
+    return (points if curvature > 0 else points @ MIRROR), views  # negative κ: depth is minus the third coordinate
+
+
+@CURVATURES
+def test_turned_images_are_those_of_turned_pinhole_cameras(curvature: float) -> None:
+    points, views = scene(curvature)
+    aimed = Aimed.of(views, curvature)
+    seen = points @ aimed.turns.transpose(0, 2, 1)
+    images = seen[..., :2] / seen[..., 2:] / curvature
+    np.testing.assert_allclose(aimed.views * aimed.turns[:, 2, 2, None, None], images, atol=1e-12)
+    middle = np.concatenate([curvature * views.mean(axis=1), np.ones((FRAMES, 1))], axis=1)
+    turned = np.einsum("fij,fj->fi", aimed.turns, middle)
+    np.testing.assert_allclose(turned[:, :2], 0, atol=1e-12)
+    np.testing.assert_allclose(aimed.turned_back(aimed.turned(aimed.turns)), aimed.turns, atol=1e-12)
+    np.testing.assert_allclose(
+        aimed.turns @ aimed.turns.transpose(0, 2, 1), np.tile(np.eye(3), (FRAMES, 1, 1)), atol=1e-12
+    )
+
+
+def test_without_perspective_each_frame_is_centred() -> None:
+    _, views = scene(0.25)
+    aimed = Aimed.of(views, 0.0)
+    np.testing.assert_allclose(aimed.views, centred(views), atol=1e-12)
+    np.testing.assert_array_equal(aimed.turns, np.tile(np.eye(3), (FRAMES, 1, 1)))
+    assert aimed.density == 0
+    close = Aimed.of(views, 1e-7)
+    np.testing.assert_allclose(close.views, aimed.views, atol=1e-5)
+
+
+@CURVATURES
+def test_tracks_corrected_with_true_depths_are_scaled_orthographic(curvature: float) -> None:
+    """With the object's origin at a depth of 1/κ along the original axis, the scale is 1 in the turned cameras, too."""
+    points, views = scene(curvature)
+    aimed = Aimed.of(views, curvature)
+    seen = points @ aimed.turns.transpose(0, 2, 1)
+    origin = np.einsum(
+        "fij,fj->fi", aimed.turns, np.concatenate([views.mean(axis=1), np.full((FRAMES, 1), 1 / curvature)], axis=1)
+    )
+    depths = aimed.turns[:, 2, 2, None] * (seen[..., 2] - origin[:, None, 2])
+    straight = corrected(aimed.views, depths, curvature)
+    np.testing.assert_allclose(straight, seen[..., :2], atol=1e-12)
+
+
+def test_density_is_the_logarithm_of_the_jacobian() -> None:
+    _, views = scene(0.25)
+    aimed, step, logs = Aimed.of(views, 0.25), 1e-6, []
+    cosine = aimed.turns[:, 2, 2, None, None]
+
+    def image(moved: np.ndarray) -> np.ndarray:
+        rays = np.concatenate([0.25 * moved, np.ones((FRAMES, POINTS, 1))], axis=2) @ aimed.turns.transpose(0, 2, 1)
+        return np.asarray(rays[..., :2] / rays[..., 2:] / 0.25 / cosine)
+
+    columns = [(image(views + step * axis) - image(views - step * axis)) / (2 * step) for axis in np.eye(2)]
+    logs = np.log(np.abs(np.linalg.det(np.stack(columns, axis=-1))))
+    assert aimed.density == pytest.approx(-logs.mean(), abs=1e-6)
+
+
+def test_slopes_match_finite_differences() -> None:
+    _, views = scene(0.25)
+    aimed, slope, density_slope = Aimed.with_slopes(views, 0.2)
+    before, after = Aimed.of(views, 0.199), Aimed.of(views, 0.201)
+    np.testing.assert_array_equal(aimed.views, Aimed.of(views, 0.2).views)
+    np.testing.assert_allclose(slope, (after.views - before.views) / 0.002, atol=1e-4)
+    assert density_slope == pytest.approx((after.density - before.density) / 0.002, abs=1e-4)
+
+
+def test_the_smallest_turn_has_its_axis_in_the_image_plane() -> None:
+    turns = towards(np.array([[0.0, 0.0], [1.0, 2.0]]), 0.3)
+    np.testing.assert_array_equal(turns[0], np.eye(3))
+    axis = turns[1] - turns[1].T
+    assert axis[1, 0] == pytest.approx(0, abs=1e-12)
+    assert turns[1, 2, 2] == pytest.approx(1 / np.sqrt(1 + 0.09 * 5))
+
+
+@pytest.mark.slow
+def test_focal_length_and_shapes_of_an_object_that_moves_through_the_picture() -> None:
+    face = gallery.face(30, 120, degrees=40)
+    seen = (face.shapes - face.shapes.mean(axis=1, keepdims=True)) @ face.rotations.transpose(0, 2, 1)
+    seen = 300 * seen / np.abs(seen).max()
+    moved = seen.copy()
+    moved[..., 0] += np.linspace(-75, 225, 30)[:, None]
+    noise = np.random.default_rng(0).normal(0, 0.1, (30, 120, 2))
+    tracks = Tracks.from_arrays((np.array(PICTURE) - 1) / 2 + moved[..., :2] / (1 + moved[..., 2:] / 900) + noise)
+    solution = solve(tracks, face.mesh, settings=Settings(image_size=PICTURE, surface="free"))
+    assert focal_error(solution.camera, 900) < 0.1
+    assert e3d_frame_scaled(solution.shapes, seen) < 0.03
