@@ -8,10 +8,10 @@ estimated from images that are turned towards the object, and then turned back.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from pliant.solver.cameras.perspective import depth_map
+from pliant.solver.cameras.perspective import DepthMap, depth_map
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 
@@ -63,9 +63,10 @@ class Aimed:
         """Return the rotations of the original cameras for those of the turned cameras, `(F, 3, 3)`."""
         return np.asarray(self.turns.transpose(0, 2, 1) @ rotations)
 
-    def depth_map(self, rotations: Floats, scales: Floats, covariance: ShapeCovariance) -> Floats:
-        """Return D of the turned cameras, shape `(F, 2F)`, times cos θ, so that depths are corrected with κ as those of `depth_map`."""
-        return np.asarray(self.turns[:, 2, 2, None] * depth_map(rotations, scales, covariance))
+    def depth_map(self, rotations: Floats, scales: Floats, covariance: ShapeCovariance) -> Floats | DepthMap:
+        """Return D of the turned cameras, shape `(F, 2F)`, times cos θ, so that κ corrects the tracks as without a turn."""
+        depth, cosine = depth_map(rotations, scales, covariance), self.turns[:, 2, 2, None]
+        return replace(depth, away=cosine * depth.away) if isinstance(depth, DepthMap) else np.asarray(cosine * depth)
 
 
 def towards(points: Floats, curvature: float) -> Floats:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pliant.solver import Settings, Tracks, gallery, solve
+from pliant.solver.cameras import perspective
 from pliant.solver.cameras.aimed import Aimed, towards
-from pliant.solver.cameras.perspective import centred, corrected
+from pliant.solver.cameras.perspective import centred, columns, corrected
 from pliant.solver.evaluation.metrics import e3d_frame_scaled, focal_error
+from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR
 
 FRAMES, POINTS = 5, 30
@@ -85,6 +87,18 @@ def test_slopes_match_finite_differences() -> None:
     np.testing.assert_array_equal(aimed.views, Aimed.of(views, 0.2).views)
     np.testing.assert_allclose(slope, (after.views - before.views) / 0.002, atol=1e-4)
     assert density_slope == pytest.approx((after.density - before.density) / 0.002, abs=1e-4)
+
+
+def test_depths_of_turned_cameras_do_not_depend_on_the_form_of_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, views = scene(0.25)
+    aimed, random = Aimed.of(views, 0.25), np.random.default_rng(1)
+    covariance = ShapeCovariance(np.eye(3), np.eye(3), 0.1 * random.normal(size=(FRAMES, 2)), 1e-4, 1e-3, 10.0)
+    images = columns(aimed.views)
+    whole = aimed.depth_map(aimed.turns, np.ones(FRAMES), covariance)
+    monkeypatch.setattr(perspective, "LEARNED_FRAMES", FRAMES - 1)
+    factored = aimed.depth_map(aimed.turns, np.ones(FRAMES), covariance)
+    assert isinstance(factored, perspective.DepthMap)
+    np.testing.assert_allclose(factored @ images, whole @ images, atol=1e-8)
 
 
 def test_the_smallest_turn_has_its_axis_in_the_image_plane() -> None:
