@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats
-from pliant.solver.tracks.frame_selection import informative_frames
 
 INTERVAL = (0.35, 3.6)
 """Ends of the interval for the error, relative to the expected error: about the 10 and 90 % quantiles of true over expected error on the
@@ -126,6 +125,7 @@ def assess(
     planar: bool = False,
     modes: int = 0,
     depth_is_typical: bool = False,
+    shown: NDArray[np.bool_] | None = None,
     behind: NDArray[np.bool_] | None = None,
 ) -> Trust:
     """Return the verdict on a result.
@@ -154,6 +154,8 @@ def assess(
         Number of modes of deformation of the prior.
     depth_is_typical : bool
         Whether a prior, not the tracks, determines the extent of depth.
+    shown : ndarray of bool, shape (F,), optional
+        Frames that show enough points for a camera of their own; None for all.
     behind : ndarray of bool, shape (F,), optional
         Frames in which points lie behind the camera; None for none.
     """
@@ -166,7 +168,7 @@ def assess(
     relative = (residuals / scales[:, None])[seen]
     pulse()
     residual = float(np.median(relative)) / size if relative.size else np.inf
-    shown = informative_frames(visible)
+    shown = np.ones(len(shapes), dtype=bool) if shown is None else shown
     turn = turned(rotations[shown])
     hidden = 1.0 - float(seen.mean())
     unseen = f"{hidden:.0%} of the positions are hidden and interpolated from their surroundings."

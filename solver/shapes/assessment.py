@@ -17,6 +17,7 @@ from pliant.solver.shapes.held_out import held_out_error
 from pliant.solver.shapes.jackknife import Changes, learning_changes
 from pliant.solver.shapes.uncertainty import Pinhole, bounded_by_neighbours, position_std
 from pliant.solver.solution import Solution
+from pliant.solver.tracks.frame_selection import informative_frames
 
 INFLATION = 1.4
 """Factor applied to the standard deviation from posterior and jackknife, for errors that both omit: model errors and other optima of the
@@ -120,6 +121,7 @@ def judged(
         planar=is_planar(estimate.gram) or on_one_line(tracks),
         modes=0 if covariance is None else covariance.modes.shape[1],
         depth_is_typical=estimate.depth_is_typical,
+        shown=informative_frames(confidence),
         behind=frames_behind(solution.camera, solution.shapes),
     )
 

@@ -12,12 +12,13 @@ from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Mesh, Tracks
 from pliant.worker.formats.cost import estimated
+from pliant.worker.formats.errors import LISTED as MAX_NAMES
 from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.ground_truth import read_rotations, read_truth
 from pliant.worker.formats.meshes.surface import Surface, check_order, read_surface, whole_grid
 from pliant.worker.formats.meshes.triangulation import triangulate
-from pliant.worker.formats.reading.containers import read_arrays
-from pliant.worker.formats.records import MAX_COORDINATE, GroundTruth, Inputs, Limits, Selection
+from pliant.worker.formats.reading.containers import read_arrays, shapes_in
+from pliant.worker.formats.records import MAX_COORDINATE, Arrays, GroundTruth, Inputs, Limits, Selection
 from pliant.worker.formats.tracks.decimation import thin
 from pliant.worker.formats.tracks.film_tracks import FilmTracks, read_film_tracks, tracks_options
 from pliant.worker.formats.tracks.interpretation import Understood, understand
@@ -70,7 +71,7 @@ def read_inputs(
         layout=understood.layout, format=understood.format, coordinates=understood.coordinates, y_axis=understood.y_axis,
         given_frames=understood.points.shape[0], given_points=understood.points.shape[1],
         num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(),
-        notes=[*understood.notes, *chosen.notes, *truth_notes],
+        notes=[*understood.notes, *unused_arrays(tracks, understood.arrays, own=film is not None), *chosen.notes, *truth_notes],
         **({} if film is None else _stated(film, chosen.selection)),
     )  # fmt: skip
     known = tracks_options(options, interpretation)
@@ -93,6 +94,17 @@ def read_inputs(
         point_names=names,
         frame_times=times,
     )
+
+
+def unused_arrays(path: Path, used: Arrays, *, own: bool) -> list[str]:
+    """Return a note that lists the arrays of an npz that the reader of tracks does not know; `own` if `pliant track` wrote the file."""
+    unknown = [(name, shape) for name, shape in shapes_in(path, {}).items() if name not in used and not own]
+    if not unknown:
+        return []
+    listed = ", ".join(f"{name} {shape}" if shape is not None else name for name, shape in unknown[:MAX_NAMES])
+    more = f" and {len(unknown) - MAX_NAMES} more" if len(unknown) > MAX_NAMES else ""
+    mesh = any(name in ("faces", "grid") for name, _ in unknown)
+    return [f"Not used: {listed}{more}." + (" Send a mesh as the part mesh." if mesh else "")]
 
 
 def _stated(film: FilmTracks, selection: Selection) -> dict[str, Any]:

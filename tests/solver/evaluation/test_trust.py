@@ -31,8 +31,7 @@ def judged(**changed: Any) -> Any:
 
 
 def test_frames_that_show_nothing_do_not_count_as_turn() -> None:
-    visible = np.where(np.arange(FRAMES)[:, None] < 7, 1.0, 0.0) * np.ones(POINTS)
-    assert judged(visible=visible).turn_degrees == pytest.approx(60 * 6 / 11)
+    assert judged(shown=np.arange(FRAMES) < 7).turn_degrees == pytest.approx(60 * 6 / 11)
 
 
 def test_points_behind_a_pinhole_camera_are_found() -> None:
@@ -78,7 +77,7 @@ def test_a_result_without_reasons_against_it_is_good() -> None:
             "In 2 of 12 frames (the first is frame 10), points of the shape lie behind the camera.",
         ),
         (
-            {"visible": np.where(np.arange(FRAMES)[:, None] < 7, 1.0, 0.0) * np.ones(POINTS)},
+            {"shown": np.arange(FRAMES) < 7},
             Verdict.WITH_CARE,
             "Hardly a point is visible in 5 of 12 frames (the first is frame 7)",
         ),

@@ -110,6 +110,36 @@ def test_visibility_above_1_may_be_a_mask_or_logits(tmp_path: Path) -> None:
     refused("out_of_range", {"tracks": POINTS, "visibility": positive}, visibility="probability")
 
 
+@pytest.mark.parametrize("name", ["confidence", "conf"])
+def test_confidence_is_read_as_visibility_and_multiplies_it(tmp_path: Path, name: str) -> None:
+    moved = POINTS + 1  # trackers write (0, 0) where a point is lost
+    sure = np.full((F, P), 0.9)
+    sure[1] = 0.3
+    got = read(tmp_path, {"tracks": moved, name: sure})
+    np.testing.assert_array_equal(got.tracks.visible, np.where((sure < 0.5), 0, sure))
+    assert f"Visibility from {name}: probabilities; below 0.5 counts as hidden." in got.interpretation.notes
+    seen = np.ones((F, P), bool)
+    seen[2, 0] = False
+    got = read(tmp_path, {"tracks": moved, "visibility": seen, name: sure})
+    np.testing.assert_array_equal(got.tracks.visible, np.where((sure < 0.5) | ~seen, 0, sure))
+    assert any(f"times {name}" in note for note in got.interpretation.notes)
+    refused("wrong_shape", {"tracks": POINTS, "visibility": seen, name: np.ones((F, 3 * P))})
+
+
+def test_arrays_that_are_not_used_are_listed(tmp_path: Path) -> None:
+    more = {"weights": np.ones((F, P)), "faces": np.array([[0, 1, 2]]), "text": np.array("words")}
+    notes = read(tmp_path, {"tracks": POINTS, **more}).interpretation.notes
+    assert [note for note in notes if note.startswith("Not used")] == [
+        f"Not used: weights ({F}, {P}), faces (1, 3), text. Send a mesh as the part mesh."
+    ]
+    many = {f"array_{number}": np.ones(2) for number in range(12)}
+    (listed,) = [
+        each for each in read(tmp_path, {"tracks": POINTS, **many}).interpretation.notes if each.startswith("Not used")
+    ]
+    assert listed.endswith("array_9 (2,) and 2 more.")
+    assert not any(each.startswith("Not used") for each in read(tmp_path, {"tracks": POINTS}).interpretation.notes)
+
+
 def test_a_matrix_may_have_visibility_for_each_coordinate_row(tmp_path: Path) -> None:
     twice = np.repeat(SEEN, 2, axis=0)
     np.testing.assert_array_equal(read(tmp_path, {"W": MATRIX, "mask": twice}).tracks.visible > 0, SEEN)

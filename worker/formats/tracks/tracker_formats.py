@@ -83,8 +83,11 @@ HIDING = ("occlusion", "occlusions", "occluded", "MD")
 
 VISIBILITY = (
     "visibility", "visible", "visibles", "pred_visibility", "vis", "mask", "vis_e", "visconfs_e", "visconf_maps_e", "visible_logits",
-    *HIDING, "expected_dist", "likelihood",
+    *HIDING, "expected_dist", "likelihood", "confidence", "conf",
 )  # fmt: skip
+CONFIDENCE = ("confidence", "conf")
+"""Names of arrays that multiply the visibility of the same file."""
+
 INTRINSICS = ("intrinsics", "fx_fy_cx_cy")
 TRUE_SHAPES = ("shapes", "S", "S_gt", "Shat_gt", "S_GT", "P3_gt", "GT", "gt")
 TRUE_ROTATIONS = ("rotations", "Rs", "R_gt", "Rs_gt", "R", "RO")

@@ -11,7 +11,7 @@ from pliant.worker.formats.errors import AmbiguousInput
 from pliant.worker.formats.records import Arrays
 from pliant.worker.formats.tracks.dense import flatten_like
 from pliant.worker.formats.tracks.layouts import Reading
-from pliant.worker.formats.tracks.tracker_formats import HIDING, VISIBILITY
+from pliant.worker.formats.tracks.tracker_formats import CONFIDENCE, HIDING, VISIBILITY
 
 SURE = 0.5
 """Probability below which a point counts as hidden, since trackers extrapolate there; above, it is kept as the weight."""
@@ -48,6 +48,11 @@ def find_visibility(
         if "expected_dist" in named:
             confidence = confidence * (1.0 - _confidence("expected_dist", named["expected_dist"], grid, "auto")[0])
             how += ", times the certainty of the position (expected_dist)"
+    certain = next((each for each in CONFIDENCE if each in named and name not in CONFIDENCE), None)
+    if certain is not None:
+        _check_number(certain, named[certain], reading)
+        confidence = confidence * _confidence(certain, named[certain], grid, "auto")[0].reshape(confidence.shape)
+        how += f", times {certain}"
     confidence = np.where(np.isfinite(confidence), confidence, 0.0)
     unsure = (confidence > 0) & (confidence < SURE)
     confidence[unsure] = 0.0
