@@ -20,7 +20,7 @@ from pliant.worker.errors import Conflict, UnknownJob, UnknownUpload
 from pliant.worker.execution.solver_settings import solver_settings
 from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.sources import FilmSource, is_source, open_source, save_source
-from pliant.worker.films.tracker import check_film, described, film_options
+from pliant.worker.films.tracker import TRACKING_OPTIONS, check_film, described, film_options
 from pliant.worker.formats import Limits, store_inputs
 from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.point_names import one_line
@@ -46,6 +46,8 @@ READING = (
     "layout", "rows", "y_axis", "coordinates", "coordinate_order", "visibility", "frames", "stride", "max_points", "min_seen",
 )  # fmt: skip
 """Options that determine how tracks are read; they cannot change for stored inputs, which have been read already."""
+OF_TRACKING = (*sorted(TRACKING_OPTIONS), "stride", "max_points", "min_seen")
+"""Options that determine the tracks of a film; those of an earlier job are kept unless they are given again."""
 LONGEST_JOB_NAME = 200
 """Maximum length of the user's label, characters."""
 
@@ -129,7 +131,7 @@ class Kept:
     form: Form
     """The form, with the earlier job's film if it had one."""
     options: Options
-    """The given options; for tracks, those of `reading_options` are the earlier job's."""
+    """The given options; those of `reading_options` (tracks) and `OF_TRACKING` (films) are the earlier job's."""
     canonical: Path | None
     """The tracks as they were read; None for a film, which is tracked again."""
 
@@ -166,7 +168,8 @@ def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept 
             for part, path in (("film", source.film), ("region", source.region))
             if path is not None
         }
-        return Kept(job, Form(files=files, texts={**form.texts, KEPT: id}), options, None)
+        had = {name: getattr(job.options, name) for name in OF_TRACKING if name not in options.model_fields_set}
+        return Kept(job, Form(files=files, texts={**form.texts, KEPT: id}), options.model_copy(update=had), None)
     fixed = reading_options(job.interpretation)
     for name in fixed:
         wanted, had = getattr(options, name), getattr(job.options, name)

@@ -101,7 +101,10 @@ def rerun(
     url: Url = HOME,
     as_json: Json = False,
 ) -> None:
-    """Submit a job's stored inputs with other options, without uploading them again, and print the new job."""
+    """Submit a job's stored inputs with other options, without uploading them again, and print the new job.
+
+    A film is tracked again in the same region and frames, unless options change them; all other options start from their defaults.
+    """
     options = parse_options(option)
     with ctx.obj.client(url, as_json=as_json) as client:
         again = find_job(client, job).run_again(options, name=name)

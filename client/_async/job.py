@@ -117,7 +117,10 @@ class AsyncRemoteJob:
         idempotency_key: str | None = None,
         timeout: float | None = None,
     ) -> AsyncRemoteJob:
-        """Submit the same inputs with other options, without uploading them again; `name` defaults to this job's."""
+        """Submit the same inputs with other options, without uploading them again; `name` defaults to this job's.
+
+        Options that determine how tracks were read, or in which region and frames a film is tracked, are this job's; others default.
+        """
         return await self._client.submit(
             inputs_of=self.id, options=options, name=name, idempotency_key=idempotency_key, timeout=timeout
         )

@@ -99,13 +99,20 @@ async def submit(
     openapi_extra={"requestBody": SUBMIT_BODY},
 )
 async def put(
-    id: Id, request: Request, response: Response, core: Core, jobs: Mine, bounds: Bound, prefer: Prefer = None
+    id: Id,
+    request: Request,
+    response: Response,
+    core: Core,
+    jobs: Mine,
+    bounds: Bound,
+    key: Key,
+    prefer: Prefer = None,
 ) -> Job:
     """Submit a job under an id that you choose: 3 to 64 letters, digits, underscores or dashes.
 
     Repeating the request is safe: the same content returns the same job with 200, other content is refused with 409.
     """
-    job, new = await _receive(request, core, jobs, bounds, id=id)
+    job, new = await _receive(request, core, jobs, bounds, id=id, idempotency_key=key)
     response.status_code = 202 if new else 200
     return await _accepted(job, core, jobs, prefer, response)
 

@@ -63,6 +63,8 @@ def combinations(
         yield "with loss l2", ("robust_scale",)
     if settings.camera in ("orthographic", "scaled_orthographic"):
         yield f"with camera {settings.camera}", ("principal_point",)
+    elif settings.camera == "auto" and settings.focal_length is None and not (settings.gaussian or known_cameras):
+        yield "with camera auto, which finds perspective only with prior gaussian", ("principal_point",)
     if not with_mesh:
         yield "without a mesh", ("laplacian", "spatial_weight")
     if known_cameras:

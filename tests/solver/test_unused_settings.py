@@ -28,6 +28,7 @@ COMBINED: list[tuple[dict[str, Any], str]] = [
     ({"prior": "smooth", "loss": "l2"}, "with loss l2"),
     ({"prior": "smooth", "camera": "orthographic"}, "with camera orthographic"),
     ({"prior": "smooth", "camera": "scaled_orthographic"}, "with camera scaled_orthographic"),
+    ({"prior": "smooth"}, "with camera auto, which finds perspective only with prior gaussian"),
     ({"prior": "smooth"}, "without a mesh"),
     ({"prior": "smooth"}, "with given rotations"),
 ]
@@ -38,11 +39,11 @@ def face() -> gallery.Sequence:
     return gallery.face(8, 120)
 
 
-def solved(face: gallery.Sequence, *, mesh: bool, **settings: Any) -> Solution:
+def solved(face: gallery.Sequence, *, mesh: bool, known: bool = True, **settings: Any) -> Solution:
     rng = np.random.default_rng(0)
     noisy = Tracks.from_arrays(face.tracks.points + rng.normal(0, 0.01, face.tracks.points.shape))
     cameras = KnownCamera.from_arrays(face.rotations, face.scales)
-    return solve(noisy, face.mesh if mesh else None, cameras=cameras, settings=Settings(**settings))
+    return solve(noisy, face.mesh if mesh else None, cameras=cameras if known else None, settings=Settings(**settings))
 
 
 @pytest.mark.parametrize(
@@ -55,17 +56,18 @@ def solved(face: gallery.Sequence, *, mesh: bool, **settings: Any) -> Solution:
 def test_settings_without_effect_change_no_bit_and_are_reported(
     face: gallery.Sequence, settings: dict[str, Any], reason: str
 ) -> None:
-    mesh = reason != "without a mesh"
+    mesh, known = reason != "without a mesh", not reason.startswith("with camera auto")
     named = {
         name
-        for why, names in combinations(Settings(**settings), with_mesh=mesh, known_cameras=True, isometric=False)
+        for why, names in combinations(Settings(**settings), with_mesh=mesh, known_cameras=known, isometric=False)
         for name in names
         if why == reason
     }
     assert named
-    plain = solved(face, mesh=mesh, **{name: value for name, value in settings.items() if name not in named})
+    kept = {name: value for name, value in settings.items() if name not in named}
+    plain = solved(face, mesh=mesh, known=known, **kept)
     for name in named:
-        given = solved(face, mesh=mesh, **{**settings, name: settings.get(name, OTHER[name])})
+        given = solved(face, mesh=mesh, known=known, **{**settings, name: settings.get(name, OTHER[name])})
         assert f"{name} has no effect {reason}." in given.choices.warnings
         np.testing.assert_array_equal(given.shapes, plain.shapes)
 
@@ -109,7 +111,8 @@ def test_every_combination_is_documented() -> None:
         (reason, name)
         for each in every
         for isometric in (True, False)
-        for reason, names in combinations(each, with_mesh=False, known_cameras=True, isometric=isometric)
+        for known in (True, False)
+        for reason, names in combinations(each, with_mesh=False, known_cameras=known, isometric=isometric)
         for name in names
     }
     rows = dict(

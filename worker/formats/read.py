@@ -130,7 +130,9 @@ def _choose(
     understood: Understood, mesh: Path | str | None, options: Options, limits: Limits, film: FilmTracks | None
 ) -> _Chosen:
     whole = understood.points.shape[:2]
-    frames, notes = chosen_frames(options.frames, whole[0])
+    frames, notes = chosen_frames(
+        options.frames, whole[0], timed=film is not None and "fps" not in options.model_fields_set
+    )
     if film is not None and mesh is None:
         surface = Surface(film.mesh, "film", ["The mesh is the grid of the film's tracker."])
     else:

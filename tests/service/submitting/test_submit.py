@@ -236,6 +236,18 @@ def test_twenty_concurrent_repetitions_create_one_job(running: Running) -> None:
     assert len(set(found)) == 1
 
 
+def test_put_observes_an_idempotency_key(http: httpx.Client) -> None:
+    key = {"Idempotency-Key": "take-7"}
+    first = http.put("/v1/jobs/take-7a", files=form(name="take"), headers=key)
+    again = http.put("/v1/jobs/take-7a", files=form(name="take"), headers=key)
+    assert (first.status_code, again.status_code) == (202, 200)
+    assert http.post("/v1/jobs", files=form(name="take"), headers=key).json()["id"] == "take-7a"
+    other = http.put("/v1/jobs/take-7b", files=form(name="take"), headers=key)
+    assert (other.status_code, other.json()["code"]) == (409, "idempotency_conflict")
+    assert "take-7a" in other.json()["detail"]
+    assert http.get("/v1/jobs/take-7b").status_code == 404
+
+
 def test_put_uses_the_id_chosen_by_the_client(http: httpx.Client) -> None:
     first = http.put("/v1/jobs/my-own-id", files=form(name="mine"))
     assert (first.status_code, first.json()["id"]) == (202, "my-own-id")

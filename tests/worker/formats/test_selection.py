@@ -83,6 +83,13 @@ def test_frames_are_selected_as_by_a_python_slice(
         assert chosen_frames(text, 10)[0].tolist() == expected
 
 
+def test_only_frames_without_times_of_their_own_run_faster() -> None:
+    assert chosen_frames("::2", 10)[1] == [
+        "Frames ::2: 5 of 10, from 0 to 8; one in 2, so at the same fps the animation runs 2 times as fast."
+    ]
+    assert chosen_frames("::2", 10, timed=True)[1] == ["Frames ::2: 5 of 10, from 0 to 8."]
+
+
 @pytest.mark.parametrize("text", ["1", "1:2:0", "1:2:-1", "a:b", "1:2:3:4", "", " 1:2"])
 def test_invalid_frame_ranges_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="frames"):

@@ -12,7 +12,7 @@ LISTED_POINTS = 10
 """Maximum number of point indices listed in a note."""
 
 
-def chosen_frames(text: str | None, num_frames: int) -> tuple[NDArray[np.intp], list[str]]:
+def chosen_frames(text: str | None, num_frames: int, *, timed: bool = False) -> tuple[NDArray[np.intp], list[str]]:
     """Resolve the option `frames`, start:stop:step as Python counts.
 
     Raises
@@ -31,7 +31,7 @@ def chosen_frames(text: str | None, num_frames: int) -> tuple[NDArray[np.intp], 
             got=f"{len(frames)} by {text}", hint="Widen the range, or omit frames to use all of them.",
         )  # fmt: skip
     note = f"Frames {text}: {len(frames)} of {num_frames}, from {frames[0]} to {frames[-1]}"
-    if step is not None and step > 1:
+    if step is not None and step > 1 and not timed:
         note += f"; one in {step}, so at the same fps the animation runs {step} times as fast"
     return frames, [f"{note}."]
 
