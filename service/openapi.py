@@ -134,8 +134,9 @@ SUBMIT_BODY: dict[str, Any] = {
                     },
                     "inputs_of": {
                         "type": "string",
-                        "description": "Instead of files: the id of one of your jobs, whose inputs are used again with these options. The options "
-                        "that determine how tracks were read, or how a film is tracked, are those of that job; for a film they may be given again.",
+                        "description": "Instead of files: the id of one of your jobs, whose inputs are used again with these options. "
+                        "Options that determine how tracks were read, or how a film is tracked, are those of that job; for a film "
+                        "they may be given again.",
                     },
                     "name": {"type": "string", "maxLength": 200, "description": "A label of your own."},
                     "webhook": {

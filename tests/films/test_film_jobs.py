@@ -88,6 +88,17 @@ def test_a_film_is_checked_without_being_tracked(film: Path, region: Path) -> No
     assert "96×72 pixels" in stated.notes[0]
 
 
+def test_a_film_has_its_own_size_and_no_use_for_options_of_tracks(film: Path) -> None:
+    facts = check_film(FilmSource(film), Options())
+    assert film_options(Options(image_size="96x72"), facts).image_size == "96x72"
+    with pytest.raises(InvalidInput) as refused:
+        film_options(Options(image_size="192x144"), facts)
+    assert (refused.value.code, refused.value.field) == ("invalid_option", "options.image_size")
+    assert "96x72" in refused.value.expected
+    notes = described(facts, film_options(Options(y_axis="up", layout="points_frames"), facts)).notes
+    assert notes[1:] == ["Not used for films: layout, y_axis."]
+
+
 def test_the_first_frame_of_the_whole_film_is_returned_on_request(film: Path, tmp_path: Path) -> None:
     assert check_film(FilmSource(film), Options()).first_frame == ""
     for frames in ("", "4:10"):

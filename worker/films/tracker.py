@@ -16,6 +16,7 @@ from pliant.worker.errors import Interrupted
 from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.sources import FilmSource
 from pliant.worker.formats.errors import damaged, too_large
+from pliant.worker.formats.unused_options import notes_on_options
 from pliant.worker.processes.contained import DONE, REFUSED, Ended, refusal_in, run_contained
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -184,7 +185,7 @@ def described(facts: FilmFacts, options: Options) -> Interpretation:
         has_ground_truth=False, has_rotations=False, layout="tracks (F, P, 2)", format=f"film ({facts.container})",
         given_frames=facts.stated_frames or None, image_size=f"{facts.width}x{facts.height}", fps=facts.fps,
         notes=[f"A film of {facts.width}×{facts.height} pixels, {count}, {options.fps:.3g} frames per second. "
-               "Its points are tracked when the job runs."],
+               "Its points are tracked when the job runs.", *notes_on_options(options, film=True)],
     )  # fmt: skip
 
 
@@ -192,8 +193,19 @@ def film_options(options: Options, facts: FilmFacts) -> Options:
     """Return the options with the film's image size, and with its frame rate unless the job sets one.
 
     Until the film is tracked this is the rate that its file states; see `FilmSource.own_rate`.
+
+    Raises
+    ------
+    InvalidInput
+        The options give another image size.
     """
-    known: dict[str, Any] = {"image_size": f"{facts.width}x{facts.height}"}
+    size = f"{facts.width}x{facts.height}"
+    if options.image_size not in (None, size):
+        raise InvalidInput(
+            "invalid_option", field="options.image_size", expected=f"{size}, the size of the film, or none", got=str(options.image_size),
+            hint="Leave it out: the film states its size.",
+        )  # fmt: skip
+    known: dict[str, Any] = {"image_size": size}
     if "fps" not in options.model_fields_set:
         known["fps"] = facts.fps
     return options.model_copy(update=known)

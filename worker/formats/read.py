@@ -24,6 +24,7 @@ from pliant.worker.formats.tracks.film_tracks import FilmTracks, read_film_track
 from pliant.worker.formats.tracks.interpretation import Understood, understand
 from pliant.worker.formats.tracks.selection import chosen_frames, hide_sparsely_observed
 from pliant.worker.formats.tracks.tracker_formats import KNOWN, OWN
+from pliant.worker.formats.unused_options import notes_on_options
 
 LISTED = 1000
 """Maximum number of hidden points that the interpretation lists by index."""
@@ -71,7 +72,10 @@ def read_inputs(
         layout=understood.layout, format=understood.format, coordinates=understood.coordinates, y_axis=understood.y_axis,
         given_frames=understood.points.shape[0], given_points=understood.points.shape[1],
         num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(),
-        notes=[*understood.notes, *unused_arrays(tracks, understood.arrays, own=film is not None), *chosen.notes, *truth_notes],
+        notes=[
+            *notes_on_options(options, film=False), *understood.notes, *unused_arrays(tracks, understood.arrays, own=film is not None),
+            *chosen.notes, *truth_notes,
+        ],
         **({} if film is None else _stated(film, chosen.selection)),
     )  # fmt: skip
     known = tracks_options(options, interpretation)

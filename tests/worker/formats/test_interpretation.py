@@ -126,6 +126,15 @@ def test_confidence_is_read_as_visibility_and_multiplies_it(tmp_path: Path, name
     refused("wrong_shape", {"tracks": POINTS, "visibility": seen, name: np.ones((F, 3 * P))})
 
 
+def test_options_for_films_are_listed_as_not_used(tmp_path: Path) -> None:
+    options = {"grid_step": 8, "region_polygon": [[0, 0], [9, 0], [9, 9]], "frames": "0:4"}
+    assert (
+        read(tmp_path, {"tracks": POINTS}, **options).interpretation.notes[0]
+        == "Not used for tracks: grid_step, region_polygon."
+    )
+    assert not any("Not used" in note for note in read(tmp_path, {"tracks": POINTS}, frames="0:4").interpretation.notes)
+
+
 def test_arrays_that_are_not_used_are_listed(tmp_path: Path) -> None:
     more = {"weights": np.ones((F, P)), "faces": np.array([[0, 1, 2]]), "text": np.array("words")}
     notes = read(tmp_path, {"tracks": POINTS, **more}).interpretation.notes
