@@ -216,7 +216,7 @@ def show_jobs(jobs: Iterable[Job], *, as_json: bool) -> None:
                  COLOURS[job.status]),
             f"{job.created_at.astimezone():%Y-%m-%d %H:%M}",
             Text(*_verdict(job)),
-            f"{job.interpretation.num_frames} × {job.interpretation.num_points}",
+            f"{job.interpretation.num_frames} × {job.interpretation.num_points or '?'}",  # a film may not be tracked yet
             Text(job.name),
         )
         for job in jobs

@@ -1,12 +1,12 @@
 """Error against camera distance: sequences with known cameras, projected with a pinhole camera.
 
-    python -m benchmarks.accuracy.distances --data DIR [--only NAME] [--points N] [--spoil KINDS] [--out FILE]
+    python -m benchmarks.accuracy.distances --data DIR [--only NAME] [--points N] [--spoil KINDS] [--travel T] [--out FILE]
 
 The true shapes, in camera axes, are scaled to a half-size (largest |coordinate|) of 300 px and projected from d half-sizes away into a
 picture of 1280 × 720 px: u = c + x/(1 + z/φ) with φ = 300·d px and c the centre. All points are visible; the solver is given `image_size`
 but not φ. Distance `inf` means orthography. `--spoil noise,drift,births,outliers,hidden,all` adds tracker errors
-(`benchmarks.accuracy.spoiling`), one kind at a time. Each metric is appended to FILE as one JSON line {method, sequence, metric, value,
-trial, distance, seconds}; finished measurements are not repeated.
+(`benchmarks.accuracy.spoiling`), one kind at a time. `--travel T` moves the object by T half-sizes from left to right. Each metric is
+appended to FILE as one JSON line {method, sequence, metric, value, trial, distance, seconds}; finished measurements are not repeated.
 """
 
 from __future__ import annotations
@@ -43,10 +43,11 @@ DOWN = np.diag([1.0, -1.0, -1.0])
 """From camera axes with y up and z towards the camera to axes with y down and z away from it."""
 
 
-def seen_from(case: Case, distance: float) -> tuple[Tracks, np.ndarray, np.ndarray]:
+def seen_from(case: Case, distance: float, *, travel: float = 0.0) -> tuple[Tracks, np.ndarray, np.ndarray]:
     """Return tracks in pixels, true shapes (F, P, 3) in pixels, and true rotations (F, 3, 3), y down.
 
-    `distance` is in half-sizes, infinite for orthography. Raises ValueError if the case has no true shapes or cameras.
+    `distance` is in half-sizes, infinite for orthography; `travel` is how far the object moves to the right, from a quarter of that left
+    of the optical axis, in half-sizes. Raises ValueError if the case has no true shapes or cameras.
     """
     if case.shapes is None or case.cameras is None:
         raise ValueError(f"{case.name} has no true shapes and cameras")
@@ -56,6 +57,7 @@ def seen_from(case: Case, distance: float) -> tuple[Tracks, np.ndarray, np.ndarr
     unit = HALF_SIZE / float(np.abs(seen).max())
     shapes, seen = unit * shapes, unit * seen
     nearer = 1 + seen[..., 2:] / (HALF_SIZE * distance)
+    seen[..., 0] += travel * HALF_SIZE * np.linspace(-0.25, 0.75, len(seen))[:, None]
     return Tracks.from_arrays((np.array(PICTURE) - 1) / 2 + seen[..., :2] / nearer), shapes, rotations
 
 
@@ -67,9 +69,9 @@ def mirrored(shapes: np.ndarray, truth: np.ndarray) -> bool:
     return float((sign * values[:, 2]).sum()) < 0
 
 
-def measure(case: Case, distance: str, method: str, *, spoil: str = "clean") -> dict[str, float]:
+def measure(case: Case, distance: str, method: str, *, spoil: str = "clean", travel: float = 0.0) -> dict[str, float]:
     """Solve one case and return its metrics; `spoil` names one of `SPOILINGS`."""
-    tracks, shapes, rotations = seen_from(case, float(distance))
+    tracks, shapes, rotations = seen_from(case, float(distance), travel=travel)
     tracks = spoiled(tracks, SPOILINGS[spoil])
     began = time.perf_counter()
     solution = solve(tracks, case.mesh, settings=Settings(camera=CAMERAS[method], image_size=PICTURE))  # type: ignore[arg-type]
@@ -88,6 +90,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--distances", default=",".join(DISTANCES), help="half-sizes, comma-separated")
     parser.add_argument("--methods", default=",".join(CAMERAS), help="comma-separated: " + ", ".join(CAMERAS))
     parser.add_argument("--spoil", default="clean", help="comma-separated: " + ", ".join(SPOILINGS))
+    parser.add_argument(
+        "--travel", type=float, default=0.0, help="half-sizes that the object moves through the picture"
+    )
     given = parser.parse_args(arguments)
     done = {(row["sequence"], row["distance"], row["method"]) for row in rows(given.out)}
     given.out.parent.mkdir(parents=True, exist_ok=True)
@@ -101,9 +106,10 @@ def main(arguments: list[str] | None = None) -> None:
                  for method in given.methods.split(",")]  # fmt: skip
         for spoil, distance, method in kinds:
             name = f"{case.name} P={case.tracks.num_points}" + ("" if spoil == "clean" else f" {spoil}")
+            name += f" travel {given.travel:g}" if given.travel else ""
             if (name, distance, method) in done:
                 continue
-            values = measure(case, distance, method, spoil=spoil)
+            values = measure(case, distance, method, spoil=spoil, travel=given.travel)
             _keep(given.out, name, distance, method, values)
             print(
                 f"{name:26} {distance:>4} {method:14} {values['e3d_frame_scaled']:8.4f} {values['e3d_frame_similarity']:8.4f} "

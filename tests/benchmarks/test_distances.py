@@ -32,6 +32,10 @@ def test_a_distant_pinhole_camera_converges_to_orthography(bench) -> None:
     near, shapes, _ = distances.seen_from(case, 3.0)
     far, _, _ = distances.seen_from(case, 1e9)
     flat, _, rotations = distances.seen_from(case, float("inf"))
+    moved, same, _ = distances.seen_from(case, float("inf"), travel=2.0)
+    path = (moved.points - flat.points)[:, 0, 0] / distances.HALF_SIZE
+    assert (path[0], path[-1]) == pytest.approx((-0.5, 1.5))
+    np.testing.assert_array_equal(same, shapes)
     np.testing.assert_allclose(far.points, flat.points, atol=1e-5)
     assert np.abs(near.points - flat.points).max() > 10
     seen = shapes @ rotations.transpose(0, 2, 1)

@@ -135,7 +135,7 @@ CASES: dict[str, Case] = {
     "a selection that is none": Case(data=film, given={"frames": "5:2"},
         words="frames: expected a number of frames from 1, or start:stop:step with start ≥ 0, stop > start and step ≥ 1, got '5:2'. For example '0:300:2', every second of the first 300 frames."),
     "two frames": Case(data=film, given={"frames": "0:2"}, track=True,
-        words="film: expected at least 3 frames, got 2. Film two seconds or more, while the object turns, or widen the selection."),
+        words="film: expected at least 3 frames, got 2. Widen the selection of the 8 frames."),
     "two pictures": Case(name="film.zip", data=lambda path: films.zip_of(path, {f"{i}.png": films.png(np.zeros((48, 64, 3), np.uint8)) for i in range(2)}), track=True,
         words="film: expected at least 3 frames, got 2 pictures in film.zip, read as a zip of pictures. Add the other frames of the film."),
     "an npz of tracks": Case(name="tracks.npz", data=lambda path: np.savez(path, tracks=np.zeros((3, 4, 2))), words=TRACKS.format("tracks.npz")),

@@ -40,6 +40,13 @@ OF_PICTURES: dict[Container, str] = {"folder": "a folder of pictures", "zip": "a
 """Films made of picture files, in words."""
 
 DEMUXERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
+
+FFMPEG = {
+    "OPENCV_FFMPEG_CAPTURE_OPTIONS": f"format_whitelist;{DEMUXERS}|protocol_whitelist;file|enable_drefs;0",
+    "OPENCV_FFMPEG_LOGLEVEL": "-8",  # quiet: faults of a film are reported by this module
+}
+"""Environment variables by which OpenCV passes options to FFmpeg; it offers no other way. The level is read once in a process."""
+
 _OPENING = threading.Lock()
 
 
@@ -90,7 +97,8 @@ class Film:
             "Film two seconds or more, while the object turns" if kind is None else "Add the other frames of the film"
         )
         if self.selection != (0, None, 1):
-            hint += ", or widen the selection"
+            known = f" of the {self.stated_frames} frames" if self.stated_frames >= LEAST_FRAMES else ""
+            hint = f"Widen the selection{known}" if known else f"{hint}, or widen the selection"
         if self.container == "folder":
             hint += ". For a track file, give its own path"
         got = str(count) if kind is None else f"{count} pictures in {self.path.name}, read as {kind}"
@@ -331,18 +339,18 @@ def _count(film: Film) -> int:
 def _open_capture(path: Path) -> cv2.VideoCapture:
     """Open a film accepted by `recognise`, with FFmpeg confined to local files and the same containers."""
     with _OPENING:
-        key = "OPENCV_FFMPEG_CAPTURE_OPTIONS"  # the only way OpenCV offers to reach FFmpeg's options
-        before = os.environ.get(key)
-        os.environ[key] = f"format_whitelist;{DEMUXERS}|protocol_whitelist;file|enable_drefs;0"
+        before = {key: os.environ.get(key) for key in FFMPEG}
+        os.environ.update(FFMPEG)
         level = cv2.utils.logging.setLogLevel(0)
         try:
             capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         finally:
             cv2.utils.logging.setLogLevel(level)
-            if before is None:
-                del os.environ[key]
-            else:
-                os.environ[key] = before
+            for key, value in before.items():
+                if value is None:
+                    del os.environ[key]
+                else:
+                    os.environ[key] = value
     if not capture.isOpened():
         raise _undecodable(path)
     return capture

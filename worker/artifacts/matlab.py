@@ -21,11 +21,12 @@ def fits(num_frames: int, num_points: int) -> bool:
 
 
 def write_mat(result: Result, file: IO[bytes]) -> None:
-    """Write the arrays of `shapes.npz` under the same names; indices in `faces` count from 1, `point_names` is a cell array."""
+    """Write the arrays of `shapes.npz` under the same names; indices (`faces`, `source_…`) count from 1, `point_names` is a cell array."""
     import scipy.io  # imported here, because the API process writes no files
 
     solution, camera = result.solution, result.solution.camera
-    names = result.inputs.point_names
+    names, chosen = result.inputs.point_names, result.inputs.selection
+    sources = {} if chosen is None else {"source_frames": chosen.frames + 1, "source_points": chosen.points + 1}
     posterior = {"shapes_std": solution.shapes_std, "inlier_probability": solution.inlier_probability}
     scipy.io.savemat(
         file,  # type: ignore[arg-type]  # documented: "str or file-like object"
@@ -45,6 +46,7 @@ def write_mat(result: Result, file: IO[bytes]) -> None:
             "trace_objective": solution.trace.objective,
             "trace_residual": solution.trace.residual,
             "trace_iterations": solution.trace.iterations,
+            **sources,
         },
         oned_as="column",
     )

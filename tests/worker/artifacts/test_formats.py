@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import importlib.util
 import io
 import json
@@ -22,6 +23,7 @@ from pliant.worker.artifacts.colours import STOPS, Painting, linear, shade
 from pliant.worker.artifacts.geometry import triangles_of, upright, vertex_normals, viewer_scale
 from pliant.worker.artifacts.scenes import usd
 from pliant.worker.execution import pipeline
+from pliant.worker.formats.records import Selection
 from results import make_result
 
 ALWAYS = {"shapes.npz", "preview.bin", "report.json"}
@@ -146,11 +148,17 @@ def test_usd_passes_its_own_validators(tmp_path: Path, mesh: str) -> None:
 
 @pytest.mark.parametrize("mesh", ["grid", "none"])
 def test_mat_holds_the_arrays_of_the_npz(tmp_path: Path, mesh: str) -> None:
-    files = write(tmp_path, make_result(mesh=mesh, outputs="mat"))
+    made = make_result(mesh=mesh, outputs="mat")
+    if mesh == "none":  # some frames and points of the files
+        chosen = Selection(np.arange(0, 14, 2), np.arange(5, 35), (14, 40))
+        made = (dataclasses.replace(made[0], selection=chosen), *made[1:])
+    files = write(tmp_path, made)
     read = scipy.io.loadmat(files["shapes.mat"])
     with np.load(files["shapes.npz"]) as arrays:
         for name, array in arrays.items():
-            expected = array + 1 if name == "faces" else array.reshape(-1, 1) if array.ndim == 1 else array
+            counted = ("faces", "source_frames", "source_points")
+            expected = array + 1 if name in counted else array
+            expected = expected.reshape(-1, 1) if array.ndim == 1 else expected
             np.testing.assert_array_equal(read[name], expected, err_msg=name)
             assert read[name].dtype == array.dtype
         assert {name for name in read if not name.startswith("__")} == set(arrays)
