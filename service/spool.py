@@ -14,7 +14,6 @@ import tempfile
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -113,11 +112,11 @@ class ParserSlots:
         self._held: Counter[str] = Counter()
         self._waiting: OrderedDict[str, deque[anyio.Event]] = OrderedDict()
 
-    async def run(self, owner: str, call: Callable[..., Answer], *arguments: object) -> Answer:
+    async def run(self, owner: str, call: Callable[[], Answer]) -> Answer:
         """Run a call once a slot is free for its owner, and return its result."""
         await self._take(owner)
         try:
-            return await to_thread.run_sync(partial(call, *arguments), limiter=self._limiter)
+            return await to_thread.run_sync(call, limiter=self._limiter)
         finally:
             self._give_back(owner)
 

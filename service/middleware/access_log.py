@@ -11,13 +11,12 @@ import secrets
 import time
 from collections.abc import Callable
 
+from pliant.service.middleware.origin import FOR_MACHINES
 from pliant.worker.logs import REQUEST_ID
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 HEADER = "X-Request-ID"
-QUIET = frozenset({"/healthz", "/readyz", "/metrics"})
-"""Paths that monitoring requests every few seconds, logged at level debug unless they fail."""
 
 READINESS = "/readyz"
 """The path whose answer 503 is an expected one: the service is starting, or waits for its store. It is logged at level info;
@@ -82,7 +81,7 @@ def _write(scope: Scope, kept: dict[str, str], *, status: int, seconds: float) -
     level = logging.ERROR if status >= 500 else logging.WARNING if status >= 400 else logging.INFO
     if scope["path"] == READINESS and status == 503:
         level = logging.INFO
-    elif level == logging.INFO and scope["path"] in QUIET:
+    elif level == logging.INFO and scope["path"] in FOR_MACHINES:
         level = logging.DEBUG
     found = _JOB.match(scope["path"])
     token = scope.get("pliant.token")

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+from pliant.service.middleware.origin import FOR_MACHINES
 from pliant.worker import tracing
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-UNTRACED = frozenset({"/healthz", "/readyz", "/metrics"})
-"""Paths that monitoring requests every few seconds."""
-
 
 class Tracing:
-    """ASGI middleware that records a span per request; with tracing off it only passes requests on."""
+    """ASGI middleware that records a span per request, except of monitoring; with tracing off it only passes requests on."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on within its span."""
-        if scope["type"] != "http" or scope["path"] in UNTRACED:
+        if scope["type"] != "http" or scope["path"] in FOR_MACHINES:
             await self._app(scope, receive, send)
             return
         with tracing.span(scope["method"], parent=Headers(scope=scope).get("traceparent")) as current:

@@ -121,7 +121,9 @@ async def put(
 def page(
     jobs: Mine,
     cursor: Annotated[str | None, Query(description="`next` of the previous page.", max_length=200)] = None,
-    limit: Annotated[int, Query(ge=1, le=LARGEST_PAGE, description="Jobs on a page.")] = 50,
+    limit: Annotated[
+        int, Query(description="Jobs on a page.", json_schema_extra={"minimum": 1, "maximum": LARGEST_PAGE})
+    ] = 50,
     status: Annotated[list[Status] | None, Query(description="Only jobs with this status; can be repeated.")] = None,
 ) -> JobPage:
     """Return your jobs, newest first."""

@@ -15,16 +15,17 @@ from pliant.schemas.problems import ProblemCode
 from pliant.service.middleware.security_headers import SecurityHeaders
 from pliant.service.page import mount_page
 from pliant.service.problems import answer
+from pliant.worker.artifacts.kinds import KINDS
 from pliant.worker.errors import InvalidRequest
 from pydantic import ValidationError
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 ID = "local"
 REPORT, PREVIEW = "report.json", "preview.bin"
-MEDIA_TYPES = {
-    ".json": "application/json", ".npz": "application/zip", ".zip": "application/zip", ".glb": "model/gltf-binary",
-    ".csv": "text/csv", ".jpg": "image/jpeg",
-}  # fmt: skip
+MEDIA_TYPES = {Path(kind.name).suffix: kind.media_type for kind in KINDS} | {
+    ".json": "application/json",
+    ".jpg": "image/jpeg",
+}
 
 
 def read_result(folder: Path) -> Job:

@@ -63,7 +63,7 @@ class InMemoryService(httpx.BaseTransport, httpx.AsyncBaseTransport):
             queue=DeliveringQueue(),
             settings=Settings(data=self.folder),
         )
-        self.tokens = Tokens(MemoryHash(), prefix="memory")  # type: ignore[arg-type]  # the four commands that Tokens uses
+        self.tokens = Tokens(MemoryHash(), prefix="memory")  # type: ignore[arg-type]  # the commands that Tokens uses
         # Any Host header is answered: the address of an in-memory service is arbitrary.
         settings = ServiceSettings(
             host="0.0.0.0",  # noqa: S104 - nothing is bound

@@ -45,10 +45,10 @@ class DeliveringQueue(MemoryQueue):
         super().__init__()
         self.deliveries: queue.SimpleQueue[tuple[str, str] | None] = queue.SimpleQueue()
 
-    def push(self, id: str, token: str, *, front: bool = False) -> None:
+    def push(self, id: str, attempt_id: str, *, front: bool = False) -> None:
         """See `Queue.push`."""
-        super().push(id, token, front=front)
-        self.deliveries.put((id, token))
+        super().push(id, attempt_id, front=front)
+        self.deliveries.put((id, attempt_id))
 
 
 class Worker:

@@ -38,13 +38,21 @@ class Aimed:
 
     @classmethod
     def of(cls, views: Floats, curvature: float) -> Aimed:
-        """Turn the cameras of images `(F, P, 2)`, relative to the principal point, in units where the focal length is 1/κ."""
+        """Turn the cameras of images `(F, P, 2)`, relative to the principal point, in units where the focal length is 1/κ.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            With this κ, rays to the object point behind a turned camera.
+        """
         middle = views.mean(axis=1)
         turns = towards(middle, curvature)
         cosine = turns[:, 2, 2]
         # For κ = 0 the third column of a turn is 0, and the object moves to the principal point by this difference of image points.
         shifted = views @ turns[:, :2, :2].transpose(0, 2, 1) - (cosine[:, None] * middle)[:, None]
         ahead = curvature * np.einsum("fc,fpc->fp", turns[:, 2, :2], views) + cosine[:, None]
+        if not ahead.min() > 0:
+            raise np.linalg.LinAlgError("rays point behind the turned camera")
         change = 3 * float(np.log(ahead).mean()) + 2 * float(np.log(cosine).mean())
         return cls(shifted / (ahead * cosine[:, None])[..., None], turns, change)
 

@@ -196,11 +196,7 @@ def _factorized(
     for each in upgrades(gram, sizes):
         factorized.append(each)
         thinned = Upgrade(each.basis_size, each.rotations[used], each.scales[used], each.residual)
-        entries.append(
-            with_fixed_rotations(
-                part, thinned, np.ones(len(part) // 2), with_scales=False, ordered=ordered, should_stop=should_stop
-            )
-        )
+        entries.append(with_fixed_rotations(part, thinned, ordered=ordered, should_stop=should_stop))
         report(Step("cameras", (0.4 + 0.04 * len(entries)) * PROGRESS_SHARE))
         if should_stop is not None and should_stop():
             break

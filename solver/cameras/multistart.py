@@ -87,17 +87,14 @@ def gram_of(gram: Floats, used: slice) -> Floats:
 def with_fixed_rotations(
     gram: Floats,
     upgrade: Upgrade,
-    scales: Floats,
     *,
-    with_scales: bool,
     ordered: bool = True,
     should_stop: Callable[[], bool] | None = None,
 ) -> Candidate:
-    """Return the cameras of a factorization, and their energy with the rotations fixed."""
+    """Return the cameras of a factorization, and their energy with the rotations fixed and every scale 1."""
     return _entered(
-        gram, upgrade.rotations, scales, upgrade.basis_size,
-        with_scales=with_scales, smooth_start=False, ordered=ordered, should_stop=should_stop,
-    )  # fmt: skip
+        gram, upgrade.rotations, upgrade.basis_size, smooth_start=False, ordered=ordered, should_stop=should_stop
+    )
 
 
 def run_multistart(
@@ -148,21 +145,18 @@ def smooth_start(gram: Floats, candidate: Candidate, *, should_stop: Callable[[]
     energy. A fit with a high noise floor and a strong camera-motion prior finds the common rotation instead.
     """
     rotations, scales = candidate.cameras
-    with_scales = candidate.scene.with_scales
     calm = Scene.of(
         gram,
         rotations,
-        with_scales=with_scales,
+        with_scales=False,
         prior_weight=SMOOTH_START_PRIOR_WEIGHT,
         noise_std_floor=SMOOTH_START_NOISE_STD,
     )
     motion, _ = fit(
         calm, start(calm, scales), iterations=SMOOTH_START_ITERATIONS, turning=True, should_stop=should_stop
     )
-    return _entered(
-        gram, *cameras_of(calm, motion), candidate.basis_size,
-        with_scales=with_scales, smooth_start=True, ordered=True, should_stop=should_stop,
-    )  # fmt: skip
+    turned, _ = cameras_of(calm, motion)
+    return _entered(gram, turned, candidate.basis_size, smooth_start=True, ordered=True, should_stop=should_stop)
 
 
 def carried(rotations: Floats, best: Floats, used: slice) -> Floats:
@@ -189,17 +183,19 @@ def carried(rotations: Floats, best: Floats, used: slice) -> Floats:
 def _entered(
     gram: Floats,
     rotations: Floats,
-    scales: Floats,
     basis_size: int,
     *,
-    with_scales: bool,
     smooth_start: bool,
     ordered: bool,
     should_stop: Callable[[], bool] | None,
 ) -> Candidate:
-    scene = Scene.of(gram, rotations, with_scales=with_scales, prior_weight=scaled_prior_weight(gram), ordered=ordered)
+    scene = Scene.of(gram, rotations, with_scales=False, prior_weight=scaled_prior_weight(gram), ordered=ordered)
     motion, energy = fit(
-        scene, start(scene, scales), iterations=FIXED_ROTATION_ITERATIONS, turning=False, should_stop=should_stop
+        scene,
+        start(scene, np.ones(len(rotations))),
+        iterations=FIXED_ROTATION_ITERATIONS,
+        turning=False,
+        should_stop=should_stop,
     )
     return Candidate(basis_size, smooth_start, scene, motion, energy)
 

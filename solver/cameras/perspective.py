@@ -152,7 +152,6 @@ def depths_of(
     views: Floats,
     curvature: float,
     *,
-    start: Floats | None = None,
     origin: Floats | None = None,
 ) -> Floats:
     """Return posterior mean depths of points, shape `(F, P)`, relative to their mean in every frame or to `origin`.
@@ -165,12 +164,10 @@ def depths_of(
         Complete tracks relative to the principal point, normalized units.
     curvature : float
         κ.
-    start : array, shape (F, P), optional
-        Depths to start the fixed point from; 0 without it.
     origin : array, shape (F, 1), optional
         From `mean_depth`, for some of the points: their own mean would be another origin than that of the others.
     """
-    depths = np.zeros(views.shape[:2]) if start is None else start
+    depths = np.zeros(views.shape[:2])
     for _ in range(DEPTH_STEPS if curvature else 1):
         images = corrected(views, depths, curvature)
         if origin is None:

@@ -42,9 +42,8 @@ def conjugate_gradient(
     max_iterations: int,
     negligible: float = 0.0,
     should_stop: Callable[[], bool] | None = None,
-    overwrite_b: bool = False,
 ) -> Solved:
-    """Solve 𝒜 x = b, starting from 0, for a symmetric positive (semi)definite 𝒜.
+    """Solve 𝒜 x = b, starting from 0, for a symmetric positive (semi)definite 𝒜; b is overwritten.
 
     Saad, Iterative Methods for Sparse Linear Systems (2003), algorithm 9.1. Every iteration decreases ½ xᵀ𝒜x − bᵀx, so
     majorise–minimise descends even if the inner solve stops early. Iterations end when √(rᵀM⁻¹r) has fallen to
@@ -53,10 +52,10 @@ def conjugate_gradient(
     iteration; once it returns True there, the current x is returned.
 
     Four arrays of the size of x are allocated once and reused, because page faults of new arrays in every iteration would
-    cost more than the arithmetic. With `overwrite_b`, b is one of them. 𝒜 times the direction and the preconditioned
+    cost more than the arithmetic; b is one of them. 𝒜 times the direction and the preconditioned
     residual share an array, as they are never needed at the same time.
     """
-    x, residual, spare = np.zeros_like(b), b if overwrite_b else b.copy(), np.empty_like(b)
+    x, residual, spare = np.zeros_like(b), b, np.empty_like(b)
     if should_stop is not None:
         should_stop()  # to report progress: first touching gigabytes of memory takes as long as an iteration
     z = precondition(residual, out=spare)

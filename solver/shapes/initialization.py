@@ -56,7 +56,7 @@ def uniform_solution(problem: Problem, translations: Floats, *, should_stop: Cal
     tick()
     solved = conjugate_gradient(
         operator.apply, right_hand_side, precondition=precondition, reduction=reduction, max_iterations=MAX_START_ITERATIONS,
-        should_stop=stops, overwrite_b=True,
+        should_stop=stops,
     )  # fmt: skip
     tick()
     return solved.x.astype(problem.points.dtype, copy=False)

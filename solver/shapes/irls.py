@@ -69,7 +69,7 @@ def step(
     tick()
     solved = conjugate_gradient(
         inner.apply, downhill, precondition=precondition, reduction=reduction, max_iterations=max_inner,
-        negligible=NEGLIGIBLE * tolerance * abs(state.objective), should_stop=should_stop, overwrite_b=True,
+        negligible=NEGLIGIBLE * tolerance * abs(state.objective), should_stop=should_stop,
     )  # fmt: skip
     del downhill, precondition, inner  # before the next weights are allocated
     shapes = np.add(state.shapes, solved.x, out=solved.x if solved.x.dtype == state.shapes.dtype else None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from functools import partial
 
 import anyio
 import pytest
@@ -22,9 +23,9 @@ def test_slots_go_to_the_owner_with_fewest_and_every_input_is_parsed() -> None:
         slots = ParserSlots(2)
         async with anyio.create_task_group() as group:
             for number in range(8):
-                group.start_soon(slots.run, "greedy", parse, f"greedy {number}")
+                group.start_soon(slots.run, "greedy", partial(parse, f"greedy {number}"))
             await until(lambda: len(began) == 2)
-            group.start_soon(slots.run, "other", parse, "other")
+            group.start_soon(slots.run, "other", partial(parse, "other"))
             await anyio.sleep(0.05)
             steps.release()
             await until(lambda: len(began) == 3)
@@ -33,7 +34,7 @@ def test_slots_go_to_the_owner_with_fewest_and_every_input_is_parsed() -> None:
                 steps.release()
         assert sorted(began) == sorted(["other", *(f"greedy {number}" for number in range(8))])
         steps.release()
-        assert await slots.run("other", parse, "afterwards") == "afterwards"
+        assert await slots.run("other", partial(parse, "afterwards")) == "afterwards"
 
     anyio.run(everything)
 

@@ -211,13 +211,13 @@ def test_a_submission_can_wait_for_the_job_to_finish(running: Running, http: htt
     path = "/v1/jobs" if verb == "POST" else "/v1/jobs/awaited-at-once"
     body = form(tracks(seed=7), name=f"awaited {verb}")
     begun = time.monotonic()
-    early = http.request(verb, path, files=body, headers={"Prefer": "wait=1", "Idempotency-Key": "awaited"})
+    early = http.request(verb, path, files=body, headers={"Prefer": "wait=1", "Idempotency-Key": f"awaited {verb}"})
     assert 0.9 < time.monotonic() - begun < 8
     assert (early.status_code, early.json()["status"]) == (202, "queued")
     assert early.headers["preference-applied"] == "wait=1"
     timer = threading.Timer(0.5, finish, (running, early.json()["id"], b"x"))
     timer.start()
-    late = http.request(verb, path, files=body, headers={"Prefer": "wait=15", "Idempotency-Key": "awaited"})
+    late = http.request(verb, path, files=body, headers={"Prefer": "wait=15", "Idempotency-Key": f"awaited {verb}"})
     timer.join()
     assert late.json()["id"] == early.json()["id"]
     assert late.json()["status"] == "succeeded"

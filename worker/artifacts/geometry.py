@@ -37,12 +37,6 @@ def vertex_normals(points: Floats | Singles, triangles: Ints) -> Singles:
     return total.astype(np.float32)
 
 
-def size_of(shapes: Floats) -> float:
-    """Return the RMS distance of the points from the centre of their frame, the reference size of relative errors."""
-    centred = shapes - shapes.mean(axis=1, keepdims=True)
-    return max(float(np.sqrt(np.square(centred).sum(axis=2).mean())), float(np.finfo(float).tiny))
-
-
 def viewer_scale(shapes: Floats) -> float:
     """Return the power of ten that scales the bounding box's diagonal to 1 … 10, for viewers that assume metres."""
     low, high = shapes.min(axis=(0, 1)), shapes.max(axis=(0, 1))

@@ -43,7 +43,8 @@ from numpy.typing import NDArray
 from pliant.solver import Mesh, Solution, Tracks
 from pliant.solver.evaluation.alignment import align
 from pliant.solver.evaluation.metrics import frame_errors
-from pliant.worker.artifacts.geometry import size_of, triangles_of
+from pliant.solver.evaluation.trust import size_of
+from pliant.worker.artifacts.geometry import triangles_of
 from pliant.worker.formats.texture import Texture
 
 NAME = "preview.bin"

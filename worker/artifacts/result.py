@@ -10,9 +10,10 @@ import numpy as np
 from pliant.schemas.options import Options
 from pliant.solver import Solution
 from pliant.solver.evaluation.metrics import point_errors
+from pliant.solver.evaluation.trust import size_of
 from pliant.worker.artifacts.animation import MAX_FRAME_TARGETS
 from pliant.worker.artifacts.colours import Painting
-from pliant.worker.artifacts.geometry import Floats, Ints, size_of, upright
+from pliant.worker.artifacts.geometry import Floats, Ints, upright
 from pliant.worker.formats import Inputs, Texture
 from pliant.worker.formats.tracks.frame_times import mean_rate, uneven
 

@@ -10,7 +10,7 @@ from pliant.schemas.invalid import Invalid, members_of
 from pliant.schemas.job import Problem
 from pliant.worker.errors import StoreUnavailable, TimedOut
 
-_NO_ROOM_FOR_A_THREAD = ("can't start new thread", os.strerror(errno.EAGAIN))
+_NO_THREADS = ("can't start new thread", os.strerror(errno.EAGAIN))
 """Messages of Python and SciPy when a thread's stack does not fit into the address space."""
 
 
@@ -20,7 +20,7 @@ def problem_of(error: BaseException, *, memory_limit: int = 0) -> Problem:
         return Problem.of(error.code, 422, detail=_sentence(str(error)), **members_of(error))
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return out_of_memory(memory_limit)
-    if memory_limit and isinstance(error, RuntimeError) and str(error) in _NO_ROOM_FOR_A_THREAD:
+    if memory_limit and isinstance(error, RuntimeError) and str(error) in _NO_THREADS:
         return out_of_memory(memory_limit)
     if isinstance(error, TimedOut):
         return Problem.of(error.code, detail=str(error), field="options.time_limit")

@@ -145,14 +145,14 @@ def finalize(watch: Watch, *, status: int, peak: int, patience: Patience) -> Sto
     sentence = f"Ended by the worker: {watch.reason}." if watch.reason is not None else how_it_ended(status)
     words = [sentence, *last_words(watch.settings, watch.attempt_id)]
 
-    def speak() -> Stored:
+    def record_verdict() -> Stored:
         change(watch.records.get(watch.id))  # raises if the outcome is recorded already
         watch.records.append_log(watch.id, words)
         words.clear()
         return watch.records.update(watch.id, change)
 
     try:
-        settled = patience.retry(speak)
+        settled = patience.retry(record_verdict)
     except (StaleAttempt, UnknownJob):
         return None
     logger.warning("job %s: %s", watch.id, sentence)

@@ -152,7 +152,7 @@ def _track(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
         longest_side=options["longest_side"],
         threads=request["threads"],
         on_step=_reporter(request["progress"], film.size),
-        on_warnings=lambda warnings: _tell(request["progress"], {"warnings": warnings}),
+        on_warnings=lambda warnings: _write_line(request["progress"], {"warnings": warnings}),
     )
     tracked.save_npz(folder / "tracks.npz")
     (folder / "contact_sheet.jpg").write_bytes(tracked.contact_sheet())
@@ -193,12 +193,12 @@ def _reporter(target: int, size: tuple[int, int]) -> Callable[[TrackingStep], No
         low, high = SHARES[step.stage]
         done = low if not step.total else low + (high - low) * min(1.0, step.done / step.total)
         line = {"done": done, "observations": _observations(step), "followed": _followed(step, size)}
-        _tell(target, line)
+        _write_line(target, line)
 
     return report
 
 
-def _tell(target: int, line: dict[str, Any]) -> None:
+def _write_line(target: int, line: dict[str, Any]) -> None:
     """Write a line to a descriptor."""
     os.write(target, json.dumps(line).encode() + b"\n")
 

@@ -61,7 +61,7 @@ def packed(pictures: Iterable[bytes], size: tuple[int, int]) -> bytes:
     parts = list(pictures)
     ends = np.cumsum([0, *map(len, parts)])
     # The offsets depend on the header's length, and so on their own digits: padding to a fixed length avoids this.
-    room = 200 + 12 * len(ends)
-    header = {"version": VERSION, "width": size[0], "height": size[1], "offsets": (16 + room + ends).tolist()}
-    text = json.dumps(header).encode().ljust(room)
-    return MAGIC + struct.pack("<II", VERSION, room) + text + b"".join(parts)
+    reserved = 200 + 12 * len(ends)
+    header = {"version": VERSION, "width": size[0], "height": size[1], "offsets": (16 + reserved + ends).tolist()}
+    text = json.dumps(header).encode().ljust(reserved)
+    return MAGIC + struct.pack("<II", VERSION, reserved) + text + b"".join(parts)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from contextlib import suppress
 from dataclasses import replace
 
 from pliant.schemas.job import Job, Status
@@ -77,6 +76,5 @@ def _check(stored: Stored, submission: Submission) -> None:
 
 def _inputs_of(stored: Stored) -> str:
     """Return the blob of the solved tracks: for a film job, `tracks.npz` instead of the film."""
-    with suppress(StopIteration):
-        return next(f"{stored.prefix}{each.name}" for each in stored.job.artifacts if each.name == TRACKS)
-    return stored.inputs
+    own = (f"{stored.prefix}{each.name}" for each in stored.job.artifacts if each.name == TRACKS)
+    return next(own, stored.inputs)

@@ -124,7 +124,7 @@ class Reconciler:
             with suppress(StaleAttempt, UnknownJob):
                 after = records.update(id, change)
                 clean_up(settings, beat.attempt_id)
-                self._say(id, f"The worker was lost; the job is {after.job.status.value} now.")
+                self._log(id, f"The worker was lost; the job is {after.job.status.value} now.")
                 if after.job.status is Status.QUEUED:
                     self.jobs.queue.push(id, fresh, front=True)  # it has been queued before
                     order_waiting(records, self.jobs.queue, [beat.owner])
@@ -153,7 +153,7 @@ class Reconciler:
         lost = {id: attempt_id for id, attempt_id in free.items() if attempt_id not in noted}
         for id, still in self._queued.look(dict(lost), gap).items():
             if still >= FORGOTTEN_AFTER and self._queue_again(id, lost[id], front=True):
-                self._say(id, "The job was missing from the queue; queued again.")
+                self._log(id, "The job was missing from the queue; queued again.")
                 back.add(id)
         if back:
             order_waiting(records, queue, {absent[id].owner for id in back})
@@ -210,6 +210,6 @@ class Reconciler:
             if is_wanted(self.jobs, key) is False:
                 self.jobs.blobs.delete(key)
 
-    def _say(self, id: str, sentence: str) -> None:
+    def _log(self, id: str, sentence: str) -> None:
         logger.warning("job %s: %s", id, sentence)
         self.jobs.records.append_log(id, [sentence])

@@ -84,7 +84,7 @@ class SilentServer:
     """
 
     clock: Callable[[], float] = time.monotonic
-    _room: threading.Condition = field(default_factory=threading.Condition)
+    _capacity: threading.Condition = field(default_factory=threading.Condition)
     _since: dict[object, float] = field(default_factory=dict)
     """When each waiting command was sent."""
     _answered: float = 0.0
@@ -102,7 +102,7 @@ class SilentServer:
             The command was not sent: the server is silent, or too many commands are waiting.
         """
         command = object()
-        with self._room:
+        with self._capacity:
             self._wait_for_turn()
             self._since[command] = self._probed = self.clock()
         answered = True
@@ -112,13 +112,13 @@ class SilentServer:
             answered = False
             raise
         finally:
-            with self._room:
+            with self._capacity:
                 now, since = self.clock(), self._since.pop(command)
                 if answered:
                     self._answered, self._silent = now, False
                 elif now - since > SILENT_AFTER:
                     self._silent = True
-                self._room.notify_all()
+                self._capacity.notify_all()
 
     def _wait_for_turn(self) -> None:
         until = self.clock() + TURN
@@ -126,9 +126,9 @@ class SilentServer:
             left = until - self.clock()
             if left <= 0:
                 raise redis.TimeoutError("too many commands are waiting for the server")
-            self._room.wait(left)
+            self._capacity.wait(left)
         if self._refuses():
-            self._room.wait(LAST_LOOK)
+            self._capacity.wait(LAST_LOOK)
             if self._refuses():
                 raise redis.TimeoutError("the server does not answer")
 

@@ -257,7 +257,3 @@ class MemoryHash:
     def hvals(self, key: str) -> list[str]:
         """Return every value of a hash."""
         return list(self._hashes.get(key, {}).values())
-
-    def hdel(self, key: str, name: str) -> None:
-        """Remove a field of a hash."""
-        self._hashes.get(key, {}).pop(name, None)

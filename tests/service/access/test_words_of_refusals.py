@@ -140,7 +140,7 @@ REQUESTS: dict[str, tuple[Request, str]] = {
     "no outputs": (("POST", "/v1/jobs/done/outputs", {"json": {"outputs": []}}),
         "outputs: expected at least 1 item, got []. Compare with the schema at /docs."),
     "too many jobs on a page": (("GET", "/v1/jobs?limit=1000", {}),
-        "limit: expected less than or equal to 200, got '1000'. Compare with the schema at /docs."),
+        "limit: expected 1–200, got 1000. Request fewer at once."),
     "a cursor that is none": (("GET", "/v1/jobs?cursor=abc", {}),
         "cursor: expected `next` of an earlier page, got 'abc'. Start again without a cursor."),
     "an unknown status": (("GET", "/v1/jobs?status=done", {}),

@@ -290,7 +290,8 @@ def test_pages_list_every_job_once_newest_first(serve: Serve) -> None:
         assert len(both) == 5
         for bad, code in (
             ({"cursor": "x"}, "invalid_cursor"),
-            ({"limit": 0}, "invalid_request"),
+            ({"limit": 0}, "invalid_limit"),
+            ({"limit": "many"}, "invalid_request"),
             ({"status": "x"}, "invalid_request"),
         ):
             answer = http.get("/v1/jobs", params=bad)

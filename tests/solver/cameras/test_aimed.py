@@ -101,6 +101,12 @@ def test_depths_of_turned_cameras_do_not_depend_on_the_form_of_the_map(monkeypat
     np.testing.assert_allclose(factored @ images, whole @ images, atol=1e-8)
 
 
+def test_rays_behind_a_turned_camera_are_an_error() -> None:
+    _, views = scene(0.25)
+    with pytest.raises(np.linalg.LinAlgError, match="behind"):
+        Aimed.of(views, 30.0)
+
+
 def test_the_smallest_turn_has_its_axis_in_the_image_plane() -> None:
     turns = towards(np.array([[0.0, 0.0], [1.0, 2.0]]), 0.3)
     np.testing.assert_array_equal(turns[0], np.eye(3))

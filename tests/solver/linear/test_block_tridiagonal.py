@@ -73,7 +73,7 @@ def test_individual_weights_need_fewer_iterations_than_mean_weights() -> None:
 
     def iterations(precondition: object) -> int:
         return conjugate_gradient(
-            given.apply, b, precondition=precondition, reduction=1e-4, max_iterations=500  # type: ignore[arg-type]
+            given.apply, b.copy(), precondition=precondition, reduction=1e-4, max_iterations=500  # type: ignore[arg-type]
         ).iterations  # fmt: skip
 
     exact, uniform = (

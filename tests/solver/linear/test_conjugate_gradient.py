@@ -28,7 +28,7 @@ def inverse(x: np.ndarray, /, out: np.ndarray | None = None) -> np.ndarray:
 
 @pytest.mark.parametrize("iterations", [1, 7, 200])
 def test_the_reported_decrease_is_that_of_the_quadratic(iterations: int) -> None:
-    found = conjugate_gradient(product, B, precondition=same, reduction=1e-9, max_iterations=iterations)
+    found = conjugate_gradient(product, B.copy(), precondition=same, reduction=1e-9, max_iterations=iterations)
     value = float(np.vdot(found.x, product(found.x)) - 2 * np.vdot(B, found.x))
     assert found.decrease == pytest.approx(-value, rel=1e-6)
 
@@ -37,7 +37,7 @@ def test_iterations_end_when_the_remaining_gain_is_negligible() -> None:
     whole = float(np.vdot(B, inverse(B)))  # with M = 𝒜, rᵀM⁻¹r is the remaining gain
     for share, expected in ((1.1, 0), (0.9, 1)):
         found = conjugate_gradient(
-            product, B, precondition=inverse, reduction=1e-9, max_iterations=1, negligible=share * whole
+            product, B.copy(), precondition=inverse, reduction=1e-9, max_iterations=1, negligible=share * whole
         )
         assert found.iterations == expected
 
@@ -51,7 +51,7 @@ def test_a_stop_is_polled_before_the_first_product_and_in_every_iteration() -> N
 
     def solved(should_stop: Callable[[], bool]) -> Solved:
         return conjugate_gradient(
-            product, B, precondition=same, reduction=1e-9, max_iterations=4, should_stop=should_stop
+            product, B.copy(), precondition=same, reduction=1e-9, max_iterations=4, should_stop=should_stop
         )
 
     assert solved(going_on).iterations == 4

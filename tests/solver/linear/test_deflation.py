@@ -57,7 +57,7 @@ def test_the_correction_halves_the_iterations_with_hidden_points() -> None:
 
     def iterations(precondition: object) -> int:
         return conjugate_gradient(
-            given.apply, b, precondition=precondition, reduction=1e-4, max_iterations=2000  # type: ignore[arg-type]
+            given.apply, b.copy(), precondition=precondition, reduction=1e-4, max_iterations=2000  # type: ignore[arg-type]
         ).iterations  # fmt: skip
 
     assert 1 < iterations(build_preconditioner(given)) < 0.5 * iterations(_alike(given))
