@@ -160,7 +160,8 @@ def existing_file(path: Path | str, name: str) -> Path:
         raise BadArgument(f"{name}: expected the path of a file, got {kind_of(path)}. Give a str or a pathlib.Path.")
     found = expanded(path, name)
     if found.is_dir():
-        raise BadArgument(f"{name}: expected a file, got the folder {found}. Give the path of a file in it.")
+        hint = "Put its pictures into a zip and give that" if name == "film" else "Give the path of a file in it"
+        raise BadArgument(f"{name}: expected a file, got the folder {found}. {hint}.")
     if not found.is_file():
         expected = EXPECTED.get(name, "a file, an array or a dictionary of arrays")
         raise BadArgument(f"{name}: expected {expected}, got no file at {found}. Check the path.")

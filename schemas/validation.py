@@ -29,6 +29,8 @@ def expectation(error: Mapping[str, Any]) -> str:
         return f"{words} {count:,} {unit}{'' if count == 1 else 's'}"
     if error["type"] == "extra_forbidden":
         return "no value, because the name is unknown"
+    if error["type"] == "tuple_type":  # of JSON, which has no tuples
+        return "a list in brackets"
     if error["type"] == "string_pattern_mismatch":
         return f"text that matches {error['ctx']['pattern']}"
     message = str(error["msg"])

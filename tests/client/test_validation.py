@@ -24,6 +24,7 @@ class Named(BaseModel):
         (Options, {"seed": 1.5}, "a valid integer"),
         (Options, {"refine_rotations": "maybe"}, "a valid boolean"),
         (OutputRequest, {"outputs": ["glb"], "normal": "none"}, "no value, because the name is unknown"),
+        (Options, {"region_polygon": "80,30 160,30 160,150"}, "a list in brackets"),
         (Named, {}, "a value"),
         (Named, {"name": "B"}, "text that matches ^[a-z]$"),
     ],

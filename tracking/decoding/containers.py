@@ -29,6 +29,8 @@ MP4_BOXES = {b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot"}
 NESTED = {b"moov", b"trak", b"mdia", b"minf", b"dinf"}
 ARRAYS = (b"\x93NUMPY", b"\x89HDF", b"MATLAB 5.0")
 """First bytes of npy, HDF5 (MATLAB 7.3, SLEAP, DeepLabCut) and MATLAB 5 files, which hold tracks."""
+PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*")
+"""First bytes of PNG, JPEG, BMP and TIFF pictures."""
 TABLES = (".csv", ".tsv", ".json")
 """Names of text files that hold tracks."""
 PHOTOS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"avif")
@@ -121,6 +123,11 @@ def _recognise_stream(stream: BinaryIO, name: str) -> Container:
         raise _refusal(
             "playlist", f"{name}, a playlist or text that refers to other files",
             "Pass the film itself; other files and addresses are never opened.",
+        )  # fmt: skip
+    if head.startswith(PICTURES) or (head[:4] == b"RIFF" and head[8:12] == b"WEBP"):
+        raise _refusal(
+            "unsupported_film", f"{name}, a single picture",
+            "Depth comes from motion: pass a film, or a zip or folder with all its pictures.",
         )  # fmt: skip
     raise _refusal("unsupported_film", f"{name}, which is none of these", "Convert it: ffmpeg -i FILM film.mp4")
 

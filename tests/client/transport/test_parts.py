@@ -203,6 +203,8 @@ def test_a_plot_shows_the_requested_frames(tmp_path: Path) -> None:
 def test_a_folder_is_not_an_input(tmp_path: Path) -> None:
     with pytest.raises(BadArgument, match="got the folder"):
         existing_file(tmp_path, "mesh")
+    with pytest.raises(BadArgument, match="Put its pictures into a zip"):
+        existing_file(tmp_path, "film")
 
 
 @pytest.mark.skipif(os.fsencode("\udcff") != b"\xff", reason="names of files are text here")

@@ -72,7 +72,7 @@ def test_a_silent_server_gets_a_few_probes_then_one_per_second() -> None:
 def test_commands_above_the_limit_are_refused_after_a_short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pliant.worker.store.calls.TURN", 0.05)
     server, end = SilentServer(clock=Clock()), threading.Event()
-    monkeypatch.setattr(server._room, "wait", lambda left: setattr(server.clock, "now", server.clock.now + left))
+    monkeypatch.setattr(server._capacity, "wait", lambda left: setattr(server.clock, "now", server.clock.now + left))
     with ThreadPoolExecutor(COMMANDS) as pool:
         waiting(server, COMMANDS, pool, end)
         with pytest.raises(redis.TimeoutError, match="too many"), server.call():
@@ -117,13 +117,13 @@ def test_a_last_moment_answer_lets_other_commands_through() -> None:
         waiting(server, PROBES, pool, end)
         clock.now += SILENT_AFTER + 0.1
         server._probed = clock.now
-        look = server._room.wait
+        look = server._capacity.wait
 
         def answered(seconds: float) -> bool:
             server._answered = clock.now  # as the thread that reads the answer does
             return look(0)
 
-        server._room.wait = answered  # type: ignore[assignment]
+        server._capacity.wait = answered  # type: ignore[assignment]
         with server.call():
             pass
         end.set()
