@@ -16,7 +16,7 @@ from playwright.sync_api import Locator, Page
 
 TRACKS = "tracks.npz"
 DONE = 180_000
-QUICK = json.dumps({"camera": "orthographic", "surface": "free", "refine_rotations": False})
+QUICK = json.dumps({"camera": "orthographic", "surface": "free"})
 """Options of a job whose result is only shown; with its cameras given, it takes a tenth of the default's time."""
 
 BOTH_WIDTHS_AND_THEMES = [
