@@ -103,7 +103,8 @@ def rerun(
 ) -> None:
     """Submit a job's stored inputs with other options, without uploading them again, and print the new job.
 
-    A film is tracked again in the same region and frames, unless options change them; all other options start from their defaults.
+    A film is tracked again with the same region, frames, grid and selection of points, unless options change them. All other options
+    start from their defaults.
     """
     options = parse_options(option)
     with ctx.obj.client(url, as_json=as_json) as client:

@@ -120,7 +120,8 @@ class RemoteJob:
     ) -> RemoteJob:
         """Submit the same inputs with other options, without uploading them again; `name` defaults to this job's.
 
-        Options that determine how tracks were read, or in which region and frames a film is tracked, are this job's; others default.
+        Options that determine how tracks were read stay as they were. A film is tracked again with the same region, frames, grid and
+        selection of points, unless `options` contain them. All other options start from their defaults.
         """
         return self._client.submit(
             inputs_of=self.id, options=options, name=name, idempotency_key=idempotency_key, timeout=timeout

@@ -16,7 +16,8 @@ from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 
 STEP = 1e-5
-"""Half of the interval of κ, inverse normalized units, for the derivative of the images."""
+"""Half of the interval of κ, inverse normalized units, for the derivative of the images: about the cube root of the rounding error, which
+balances it against the error of the difference quotient."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +44,7 @@ class Aimed:
         Raises
         ------
         numpy.linalg.LinAlgError
-            With this κ, rays to the object point behind a turned camera.
+            With this κ, some points of the object lie behind a turned camera.
         """
         middle = views.mean(axis=1)
         turns = towards(middle, curvature)
@@ -52,9 +53,14 @@ class Aimed:
         shifted = views @ turns[:, :2, :2].transpose(0, 2, 1) - (cosine[:, None] * middle)[:, None]
         ahead = curvature * np.einsum("fc,fpc->fp", turns[:, 2, :2], views) + cosine[:, None]
         if not ahead.min() > 0:
-            raise np.linalg.LinAlgError("rays point behind the turned camera")
+            raise np.linalg.LinAlgError("points lie behind a turned camera")
         change = 3 * float(np.log(ahead).mean()) + 2 * float(np.log(cosine).mean())
         return cls(shifted / (ahead * cosine[:, None])[..., None], turns, change)
+
+    @classmethod
+    def unturned(cls, views: Floats) -> Aimed:
+        """Return the images of cameras that are not turned, such as those with known rotations."""
+        return cls(views, np.tile(np.eye(3), (len(views), 1, 1)), 0.0)
 
     @classmethod
     def with_slopes(cls, views: Floats, curvature: float) -> tuple[Aimed, Floats, float]:
@@ -66,10 +72,6 @@ class Aimed:
     def turned(self, rotations: Floats) -> Floats:
         """Return the rotations of the turned cameras for those of the original cameras, `(F, 3, 3)`."""
         return np.asarray(self.turns @ rotations)
-
-    def turned_back(self, rotations: Floats) -> Floats:
-        """Return the rotations of the original cameras for those of the turned cameras, `(F, 3, 3)`."""
-        return np.asarray(self.turns.transpose(0, 2, 1) @ rotations)
 
     def depth_map(self, rotations: Floats, scales: Floats, covariance: ShapeCovariance) -> Floats | DepthMap:
         """Return D of the turned cameras, shape `(F, 2F)`, times cos θ, so that κ corrects the tracks as without a turn."""

@@ -66,7 +66,7 @@ def alternated(
         if should_stop is not None and should_stop():
             break
         try:
-            found = _relearned(view, found, used, model_order)
+            found = _relearned(view, found, used, model_order, turning=turning)
         except np.linalg.LinAlgError:
             break
         found, view = _with_focal(view, found, used, turning=turning)
@@ -142,8 +142,11 @@ def aligned(rotations: Floats, like: Floats, used: NDArray[np.intp]) -> Floats:
     return np.asarray(min(choices, key=lambda choice: choice[0])[1])
 
 
-def _relearned(view: Perspective, found: Learned, used: NDArray[np.intp], model_order: ModelOrder) -> Learned:
-    aimed = Aimed.of(view.sample[used], view.curvature)
+def _relearned(
+    view: Perspective, found: Learned, used: NDArray[np.intp], model_order: ModelOrder, *, turning: bool
+) -> Learned:
+    views = view.sample[used]
+    aimed = Aimed.of(views, view.curvature) if turning else Aimed.unturned(views)
     rotations = aimed.turned(found.rotations)
     depth = aimed.depth_map(rotations, found.scales, found.covariance)
     again = annealed_at(

@@ -6,11 +6,13 @@ wrong κ or the wrong sign of depth needs more of them. The likelihood of the co
 therefore has its maximum near the true κ; κ < 0 stands for mirrored depths, and κ = 0 is orthography. Every κ continues from cameras and
 covariance of a neighbour, since the likelihoods of separate optima differ by more than perspective adds to noisy tracks.
 
-The comparison needs few frames. Its κ is then refined on all frames, jointly with cameras and modes: between two updates of the depths z,
-the corrected tracks v + κ v z are linear in κ, so their Gram matrix is G₀ + κ G₁ + κ² G₂, and L-BFGS treats κ as one more parameter with
-the gradient
+The comparison needs few frames. Its κ is then refined on all frames, jointly with cameras and modes. Estimated cameras are turned towards
+the object (`cameras.aimed`). Between two updates of the depths z, the corrected tracks are linearized in the change δ of κ, so their Gram
+matrix is G₀ + δ G₁ + δ² G₂, and L-BFGS treats κ as one more parameter with the gradient
 
-    ∂E/∂κ = tr M⁻¹(G₁ + 2κ G₂) / 2F − 2 mean z/(1 + κz).
+    ∂E/∂κ = tr M⁻¹(G₁ + 2δ G₂) / 2F + d′ − 2 mean z/(1 + κz),
+
+where d′ is the derivative of the density of the turn. Known rotations are not turned: the corrected tracks v + κ v z are then linear in κ.
 """
 
 from __future__ import annotations
@@ -314,8 +316,9 @@ def refined_with_focal(
     iterations : int
         L-BFGS iterations.
     """
-    start = replace(found, rotations=Aimed.of(views, curvature).turned(found.rotations))
-    energy = corrected_energy(views, curvature, start, with_scales=with_scales)
+    turns = towards(views.mean(axis=1), curvature)
+    start = replace(found, rotations=turns @ found.rotations) if turning else found
+    energy = corrected_energy(views, curvature, start, with_scales=with_scales, turning=turning)
     motion = motion_of(energy.scene, start)
     held = 0 if turning else 3 * len(views)
     given = np.append(motion.flat(), curvature)
@@ -338,12 +341,17 @@ def refined_with_focal(
 class corrected_energy:  # noqa: N801
     """E of tracks corrected with fixed depths, as a function of the likelihood's parameters, followed by κ.
 
-    The tracks are turned towards the object (`cameras.aimed`), and linear in the change of κ. `found` has cameras that are turned likewise.
+    The tracks are linear in the change of κ. With `turning`, they are turned towards the object (`cameras.aimed`), as are the cameras of
+    `found`. Rotations that are known are not: they would have to turn with κ.
     """
 
-    def __init__(self, views: Floats, curvature: float, found: Learned, *, with_scales: bool) -> None:
+    def __init__(
+        self, views: Floats, curvature: float, found: Learned, *, with_scales: bool, turning: bool = True
+    ) -> None:
         count = views.shape[1]
-        aimed, slope, self.density_slope = Aimed.with_slopes(views, curvature)
+        aimed, slope, self.density_slope = Aimed.unturned(views), np.zeros_like(views), 0.0
+        if turning:
+            aimed, slope, self.density_slope = Aimed.with_slopes(views, curvature)
         depths = depths_of(aimed.depth_map(found.rotations, found.scales, found.covariance), aimed.views, curvature)
         changed = slope * (1 + curvature * depths)[..., None] + aimed.views * depths[..., None]
         plain, along = columns(centred(corrected(aimed.views, depths, curvature))), columns(centred(changed))

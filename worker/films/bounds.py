@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from pliant.worker.settings import Settings
 
 
-LONGEST = 604_800.0
+LONGEST_TRACKING = 604_800.0
 """Seconds of tracking where nothing else limits a job's time: one week, the largest `time_limit` of a job."""
 
 
@@ -32,7 +32,7 @@ class FilmBounds:
     check_seconds: float = 30.0
     """Wall time of the check at submission, seconds."""
 
-    track_seconds: float = LONGEST
+    track_seconds: float = LONGEST_TRACKING
     """Wall time of tracking, seconds."""
 
     memory: int = 4 << 30
@@ -47,5 +47,5 @@ class FilmBounds:
         memory = min(settings.film_memory, settings.memory_limit or settings.film_memory)
         return cls(
             max_bytes=max_bytes, max_frames=settings.film_frames, max_pixels=settings.film_pixels,
-            max_seconds=settings.film_seconds, track_seconds=settings.time_limit or LONGEST, memory=memory,
+            max_seconds=settings.film_seconds, track_seconds=settings.time_limit or LONGEST_TRACKING, memory=memory,
         )  # fmt: skip

@@ -19,7 +19,7 @@ FULL = "a full matrix of real numbers, such as W"
 SAVE_MATRIX = "Save the 2F × P matrix, a sparse one after W = full(W): save('tracks.mat', 'W', '-v7')."
 """What files of MATLAB must hold, and how to write them."""
 
-LISTED, LONGEST_NAME = 10, 40
+MAX_NAMES, LONGEST_NAME = 10, 40
 """Numbers of arrays that an error lists, and of characters of each name."""
 
 
@@ -42,9 +42,10 @@ class AmbiguousInput(InvalidInput):
 def missing_array(field: str, *, expected: str, there: Mapping[str, tuple[int, ...] | None], hint: str) -> InvalidInput:
     """Return the error for a file without the array that is needed; `there` are the names and, if known, shapes of what it has."""
     listed = [
-        name[:LONGEST_NAME] + ("" if shape is None else f" {shape}") for name, shape in sorted(there.items())[:LISTED]
+        name[:LONGEST_NAME] + ("" if shape is None else f" {shape}")
+        for name, shape in sorted(there.items())[:MAX_NAMES]
     ]
-    more = f" and {len(there) - LISTED} more" if len(there) > LISTED else ""
+    more = f" and {len(there) - MAX_NAMES} more" if len(there) > MAX_NAMES else ""
     got = ", ".join(listed) + more or "no array"
     return InvalidInput("missing_array", field=field, expected=expected, got=got, hint=hint)
 

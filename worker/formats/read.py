@@ -12,8 +12,7 @@ from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Mesh, Tracks
 from pliant.worker.formats.cost import estimated
-from pliant.worker.formats.errors import LISTED as MAX_NAMES
-from pliant.worker.formats.errors import too_large
+from pliant.worker.formats.errors import MAX_NAMES, too_large
 from pliant.worker.formats.ground_truth import read_rotations, read_truth
 from pliant.worker.formats.meshes.surface import Surface, check_order, read_surface, whole_grid
 from pliant.worker.formats.meshes.triangulation import triangulate
@@ -73,7 +72,8 @@ def read_inputs(
         given_frames=understood.points.shape[0], given_points=understood.points.shape[1],
         num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(),
         notes=[
-            *notes_on_options(options, film=False), *understood.notes, *unused_arrays(tracks, understood.arrays, own=film is not None),
+            *notes_on_options(options, film=False), *understood.notes,
+            *unused_arrays(tracks, understood.arrays, own=film is not None, has_mesh=mesh is not None),
             *chosen.notes, *truth_notes,
         ],
         **({} if film is None else _stated(film, chosen.selection)),
@@ -100,14 +100,17 @@ def read_inputs(
     )
 
 
-def unused_arrays(path: Path, used: Arrays, *, own: bool) -> list[str]:
-    """Return a note that lists the arrays of an npz that the reader of tracks does not know; `own` if `pliant track` wrote the file."""
+def unused_arrays(path: Path, used: Arrays, *, own: bool, has_mesh: bool) -> list[str]:
+    """Return a note that lists the arrays of an npz that the reader of tracks does not know.
+
+    `own` if `pliant track` wrote the file; `has_mesh` if the job has a mesh of its own.
+    """
     unknown = [(name, shape) for name, shape in shapes_in(path, {}).items() if name not in used and not own]
     if not unknown:
         return []
     listed = ", ".join(f"{name} {shape}" if shape is not None else name for name, shape in unknown[:MAX_NAMES])
     more = f" and {len(unknown) - MAX_NAMES} more" if len(unknown) > MAX_NAMES else ""
-    mesh = any(name in ("faces", "grid") for name, _ in unknown)
+    mesh = not has_mesh and any(name in ("faces", "grid") for name, _ in unknown)
     return [f"Not used: {listed}{more}." + (" Send a mesh as the part mesh." if mesh else "")]
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pliant.solver import Settings, Tracks, gallery, solve
+from pliant.solver import KnownCamera, Settings, Tracks, gallery, solve
 from pliant.solver.cameras import perspective
 from pliant.solver.cameras.aimed import Aimed, towards
 from pliant.solver.cameras.perspective import centred, columns, corrected
 from pliant.solver.evaluation.metrics import e3d_frame_scaled, focal_error
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.model.so3 import MIRROR
+from pliant.solver.model.so3 import MIRROR, exponential
+from pliant.solver.refinement.focal_length import corrected_energy
+from pliant.solver.refinement.learned import Learned, motion_of
 
 FRAMES, POINTS = 5, 30
 CURVATURES = pytest.mark.parametrize("curvature", [0.25, -0.25])
@@ -36,7 +38,6 @@ def test_turned_images_are_those_of_turned_pinhole_cameras(curvature: float) -> 
     middle = np.concatenate([curvature * views.mean(axis=1), np.ones((FRAMES, 1))], axis=1)
     turned = np.einsum("fij,fj->fi", aimed.turns, middle)
     np.testing.assert_allclose(turned[:, :2], 0, atol=1e-12)
-    np.testing.assert_allclose(aimed.turned_back(aimed.turned(aimed.turns)), aimed.turns, atol=1e-12)
     np.testing.assert_allclose(
         aimed.turns @ aimed.turns.transpose(0, 2, 1), np.tile(np.eye(3), (FRAMES, 1, 1)), atol=1e-12
     )
@@ -113,6 +114,45 @@ def test_the_smallest_turn_has_its_axis_in_the_image_plane() -> None:
     axis = turns[1] - turns[1].T
     assert axis[1, 0] == pytest.approx(0, abs=1e-12)
     assert turns[1, 2, 2] == pytest.approx(1 / np.sqrt(1 + 0.09 * 5))
+
+
+def test_the_derivative_of_the_energy_with_known_rotations_is_exact() -> None:
+    _, views = scene(0.25)
+    random = np.random.default_rng(4)
+    covariance = ShapeCovariance(np.eye(3), np.eye(3), 0.1 * random.normal(size=(FRAMES, 2)), 0.1, 1e-3, np.inf)
+    found = Learned(exponential(0.3 * random.normal(size=(FRAMES, 3))), np.ones(FRAMES), covariance, np.inf)
+    energy = corrected_energy(views, 0.2, found, with_scales=False, turning=False)
+    given = motion_of(energy.scene, found).flat()
+    for curvature in (0.17, 0.2):
+        value, gradient = energy(np.append(given, curvature))
+        other = corrected_energy(views, curvature, found, with_scales=False, turning=False)
+        depths = energy.depths
+        rows = columns(centred(corrected(views, depths, curvature)))
+        np.testing.assert_allclose(
+            energy.grams[0] + (curvature - 0.2) * energy.grams[1] + (curvature - 0.2) ** 2 * energy.grams[2],
+            rows @ rows.T / POINTS, atol=1e-12,
+        )  # fmt: skip
+        assert other.density == energy.density == 0
+        step = 1e-5
+        slope = (energy(np.append(given, curvature + step))[0] - energy(np.append(given, curvature - step))[0]) / (
+            2 * step
+        )
+        assert gradient[-1] == pytest.approx(slope, rel=1e-4, abs=1e-7)
+        assert np.isfinite(value)
+
+
+@pytest.mark.slow
+def test_the_focal_length_of_given_cameras_with_a_moving_object() -> None:
+    face = gallery.face(16, 60, degrees=40)
+    seen = (face.shapes - face.shapes.mean(axis=1, keepdims=True)) @ face.rotations.transpose(0, 2, 1)
+    seen = 300 * seen / np.abs(seen).max()
+    moved = seen.copy()
+    moved[..., 0] += np.linspace(-200, 400, 16)[:, None]
+    noise = np.random.default_rng(0).normal(0, 0.3, (16, 60, 2))
+    tracks = Tracks.from_arrays((np.array(PICTURE) - 1) / 2 + moved[..., :2] / (1 + moved[..., 2:] / 900) + noise)
+    known = KnownCamera.from_arrays(face.rotations)
+    solution = solve(tracks, cameras=known, settings=Settings(image_size=PICTURE, camera="perspective"))
+    assert focal_error(solution.camera, 900) < 0.01
 
 
 @pytest.mark.slow

@@ -123,7 +123,11 @@ def test_confidence_is_read_as_visibility_and_multiplies_it(tmp_path: Path, name
     got = read(tmp_path, {"tracks": moved, "visibility": seen, name: sure})
     np.testing.assert_array_equal(got.tracks.visible, np.where((sure < 0.5) | ~seen, 0, sure))
     assert any(f"times {name}" in note for note in got.interpretation.notes)
-    refused("wrong_shape", {"tracks": POINTS, "visibility": seen, name: np.ones((F, 3 * P))})
+    for other in (np.ones(F), np.ones((P, F)), np.ones((F, 3 * P)), np.full((F, P), 90.0), np.array(0.5)):
+        for more in ({}, {"visibility": seen}):
+            got = read(tmp_path, {"tracks": moved, name: other, **more})
+            assert any(note.startswith(f"Not used: {name} {other.shape}") for note in got.interpretation.notes)
+            np.testing.assert_array_equal(got.tracks.visible > 0, seen if more else np.ones((F, P), bool))
 
 
 def test_options_for_films_are_listed_as_not_used(tmp_path: Path) -> None:
@@ -139,8 +143,10 @@ def test_arrays_that_are_not_used_are_listed(tmp_path: Path) -> None:
     more = {"weights": np.ones((F, P)), "faces": np.array([[0, 1, 2]]), "text": np.array("words")}
     notes = read(tmp_path, {"tracks": POINTS, **more}).interpretation.notes
     assert [note for note in notes if note.startswith("Not used")] == [
-        f"Not used: weights ({F}, {P}), faces (1, 3), text. Send a mesh as the part mesh."
+        f"Not used: weights ({F}, {P}), faces (1, 3), text."
     ]
+    without = read_inputs(tracks=tmp_path / "tracks.npz", options=Options()).interpretation.notes
+    assert any(note.endswith("text. Send a mesh as the part mesh.") for note in without)
     many = {f"array_{number}": np.ones(2) for number in range(12)}
     (listed,) = [
         each for each in read(tmp_path, {"tracks": POINTS, **many}).interpretation.notes if each.startswith("Not used")

@@ -23,7 +23,7 @@ from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.finished import Finished
 from pliant.worker.jobs.retry import retry
 from pliant.worker.jobs.service import Jobs
-from pliant.worker.jobs.submission import Submission, key_digest
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.records import Stored, utc_now
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.store.redis import RedisRecords
@@ -131,25 +131,27 @@ def test_a_repeated_request_returns_the_first_job(jobs: Jobs, submit) -> None:  
     assert len(blob_names(jobs)) == 2
 
 
+@pytest.mark.parametrize("jobs", ["redis"], indirect=True)
+@pytest.mark.parametrize("during", ["find", "create"])
 def test_a_request_whose_first_job_is_deleted_meanwhile_creates_a_new_job(
-    jobs: Jobs, submit, monkeypatch: pytest.MonkeyPatch
+    jobs: Jobs, submit, monkeypatch: pytest.MonkeyPatch, during: str
 ) -> None:  # type: ignore[no-untyped-def]
     first = submit(idempotency_key="k", fingerprint="f")
-    read = jobs.records.get
+    read, deleted = RedisRecords.get, []
 
-    def deleted_before(id: str) -> Stored:
-        monkeypatch.setattr(type(jobs.records), "get", staticmethod(read))
-        jobs.records.delete(read(id), at=utc_now())
-        return read(id)
+    def delete_before(records: RedisRecords, id: str) -> Stored:
+        if not deleted:
+            deleted.append(id)
+            records.delete(read(records, id), at=utc_now())
+        return read(records, id)
 
-    monkeypatch.setattr(type(jobs.records), "get", staticmethod(deleted_before))
-    key = key_digest("k", None)
-    assert key is not None
-    if isinstance(jobs.records, RedisRecords):
-        assert jobs.records.find(key) is None
-    else:
-        jobs.records.delete(read(first.id), at=utc_now())
-    assert submit(idempotency_key="k", fingerprint="f").id != first.id
+    monkeypatch.setattr(RedisRecords, "get", delete_before)
+    if during == "create":  # the first job is stored between the two
+        monkeypatch.setattr(RedisRecords, "find", lambda records, key: None)
+    again = submit(idempotency_key="k", fingerprint="f")
+    assert deleted == [first.id]
+    assert again.id != first.id
+    assert jobs.get(again.id).status is Status.QUEUED
 
 
 def test_a_chosen_id_can_be_used_only_once(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]

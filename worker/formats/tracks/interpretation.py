@@ -74,8 +74,7 @@ def understand(arrays: Arrays, options: Options, *, file: Path | None = None) ->
     flat = flatten(name, _numeric(named[name], name))
     array, depths, named = _two_numbers(flat.array, name, dialect, named)
     reading, notes = choose(name, array, dialect=dialect, options=options)
-    found = find_visibility(named, reading, grid=flat.grid, kind=options.visibility)
-    visible, how = (None, []) if found is None else found
+    visible, how = find_visibility(named, reading, grid=flat.grid, kind=options.visibility)
     if depths is None:
         picture = None if flat.grid is None else (flat.grid[1], flat.grid[0])
         placed = place(reading.points, options, picture=picture)

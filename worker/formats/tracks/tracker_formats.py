@@ -83,17 +83,17 @@ HIDING = ("occlusion", "occlusions", "occluded", "MD")
 
 VISIBILITY = (
     "visibility", "visible", "visibles", "pred_visibility", "vis", "mask", "vis_e", "visconfs_e", "visconf_maps_e", "visible_logits",
-    *HIDING, "expected_dist", "likelihood", "confidence", "conf",
+    *HIDING, "expected_dist", "likelihood",
 )  # fmt: skip
-CONFIDENCE = ("confidence", "conf")
-"""Names of arrays that multiply the visibility of the same file."""
+CERTAINTY = ("confidence", "conf")
+"""Names of arrays that multiply the visibility of the same file, if there is one."""
 
 INTRINSICS = ("intrinsics", "fx_fy_cx_cy")
 TRUE_SHAPES = ("shapes", "S", "S_gt", "Shat_gt", "S_GT", "P3_gt", "GT", "gt")
 TRUE_ROTATIONS = ("rotations", "Rs", "R_gt", "Rs_gt", "R", "RO")
 
 TRACKS = frozenset(name for dialect in DIALECTS for name in dialect.tracks)
-KNOWN = TRACKS | {"frame_indices", NAMES, *VISIBILITY, *INTRINSICS, *TRUE_SHAPES, *TRUE_ROTATIONS}
+KNOWN = TRACKS | {"frame_indices", NAMES, *VISIBILITY, *CERTAINTY, *INTRINSICS, *TRUE_SHAPES, *TRUE_ROTATIONS}
 """All array names that the track reader uses; other members of an npz are never inflated."""
 
 

@@ -11,7 +11,7 @@ from pliant.worker.formats.errors import AmbiguousInput
 from pliant.worker.formats.records import Arrays
 from pliant.worker.formats.tracks.dense import flatten_like
 from pliant.worker.formats.tracks.layouts import Reading
-from pliant.worker.formats.tracks.tracker_formats import CONFIDENCE, HIDING, VISIBILITY
+from pliant.worker.formats.tracks.tracker_formats import CERTAINTY, HIDING, VISIBILITY
 
 SURE = 0.5
 """Probability below which a point counts as hidden, since trackers extrapolate there; above, it is kept as the weight."""
@@ -22,8 +22,8 @@ TWO_MAPS = ("visconfs_e", "visconf_maps_e")
 
 def find_visibility(
     named: Arrays, reading: Reading, *, grid: tuple[int, int] | None, kind: str
-) -> tuple[NDArray[np.float64], list[str]] | None:
-    """Return the confidence `(F, P)` in [0, 1] that each point is visible, and notes; None if the file has no visibility.
+) -> tuple[NDArray[np.float64] | None, list[str]]:
+    """Return the confidence `(F, P)` in [0, 1] that each point is visible, None if the file has no visibility; and notes.
 
     `reading`, the interpretation of the tracks, is applied to visibility as well; `grid` is the size of the picture whose pixels
     the points are; `kind` is the option `visibility`.
@@ -36,8 +36,36 @@ def find_visibility(
         Code out_of_range: numbers above 1 that may be a mask or logits.
     """
     name = next((name for name in VISIBILITY if name in named and name != "expected_dist"), None)
-    if name is None:
-        return None
+    found: list[tuple[NDArray[np.float64], str, str]] = []
+    if name is not None:
+        found.append((*_visibility(name, named, reading, grid, kind), name))
+    notes: list[str] = []
+    certain = next((each for each in CERTAINTY if each in named), None)
+    if certain is not None:
+        values = _certainty(certain, named[certain], reading, grid)
+        if values is None:
+            notes.append(
+                f"Not used: {certain} {named[certain].shape}, which has no number from 0 to 1 for each observation."
+            )
+        else:
+            found.append((values, "probabilities", certain))
+    if not found:
+        return None, notes
+    confidence, how, name = found[0]
+    if len(found) == 2:
+        confidence, how = confidence * found[1][0], f"{how}, times {certain}"
+    unsure = (confidence > 0) & (confidence < SURE)
+    confidence[unsure] = 0.0
+    return confidence, [
+        f"Visibility from {name}: {how}" + (f"; below {SURE:g} counts as hidden." if unsure.any() else "."),
+        *notes,
+    ]
+
+
+def _visibility(
+    name: str, named: Arrays, reading: Reading, grid: tuple[int, int] | None, kind: str
+) -> tuple[NDArray[np.float64], str]:
+    """Return the probability `(F, P)` that each point is visible, 0 where it is not finite, and how it was read."""
     for each in (name, "expected_dist"):
         if each in named:
             _check_number(each, named[each], reading)
@@ -48,17 +76,19 @@ def find_visibility(
         if "expected_dist" in named:
             confidence = confidence * (1.0 - _confidence("expected_dist", named["expected_dist"], grid, "auto")[0])
             how += ", times the certainty of the position (expected_dist)"
-    certain = next((each for each in CONFIDENCE if each in named and name not in CONFIDENCE), None)
-    if certain is not None:
-        _check_number(certain, named[certain], reading)
-        confidence = confidence * _confidence(certain, named[certain], grid, "auto")[0].reshape(confidence.shape)
-        how += f", times {certain}"
-    confidence = np.where(np.isfinite(confidence), confidence, 0.0)
-    unsure = (confidence > 0) & (confidence < SURE)
-    confidence[unsure] = 0.0
-    confidence = _arranged(confidence, reading, name)
-    note = f"Visibility from {name}: {how}" + (f"; below {SURE:g} counts as hidden." if unsure.any() else ".")
-    return confidence, [note]
+    return np.array(_arranged(np.where(np.isfinite(confidence), confidence, 0.0), reading, name)), how
+
+
+def _certainty(
+    name: str, array: NDArray[np.generic], reading: Reading, grid: tuple[int, int] | None
+) -> NDArray[np.float64] | None:
+    """Return an array of probabilities as `(F, P)`, 0 where not finite; None if it does not fit the tracks or is not within [0, 1]."""
+    try:
+        _check_number(name, array, reading)
+        values, _ = _confidence(name, array, grid, "probability")
+        return np.array(_arranged(np.where(np.isfinite(values), values, 0.0), reading, name))
+    except InvalidInput:
+        return None
 
 
 def _check_number(name: str, array: NDArray[np.generic], reading: Reading) -> None:
