@@ -124,32 +124,28 @@ def test_the_derivative_of_the_energy_with_known_rotations_is_exact() -> None:
     energy = corrected_energy(views, 0.2, found, with_scales=False, turning=False)
     given = motion_of(energy.scene, found).flat()
     for curvature in (0.17, 0.2):
-        value, gradient = energy(np.append(given, curvature))
-        other = corrected_energy(views, curvature, found, with_scales=False, turning=False)
-        depths = energy.depths
-        rows = columns(centred(corrected(views, depths, curvature)))
-        np.testing.assert_allclose(
-            energy.grams[0] + (curvature - 0.2) * energy.grams[1] + (curvature - 0.2) ** 2 * energy.grams[2],
-            rows @ rows.T / POINTS, atol=1e-12,
-        )  # fmt: skip
-        assert other.density == energy.density == 0
-        step = 1e-5
-        slope = (energy(np.append(given, curvature + step))[0] - energy(np.append(given, curvature - step))[0]) / (
-            2 * step
-        )
-        assert gradient[-1] == pytest.approx(slope, rel=1e-4, abs=1e-7)
-        assert np.isfinite(value)
+        more, step = curvature - 0.2, 1e-5
+        rows = columns(centred(corrected(views, energy.depths, curvature)))
+        gram = energy.grams[0] + more * energy.grams[1] + more**2 * energy.grams[2]
+        np.testing.assert_allclose(gram, rows @ rows.T / POINTS, atol=1e-12)
+        _, gradient = energy(np.append(given, curvature))
+        below, above = (energy(np.append(given, curvature + each))[0] for each in (-step, step))
+        assert gradient[-1] == pytest.approx((above - below) / (2 * step), rel=1e-4, abs=1e-7)
+
+
+def moving_face(face: gallery.Sequence, path: np.ndarray, *, noise: float) -> tuple[np.ndarray, Tracks]:
+    """Shapes in camera axes, half-size 300 px, and their noisy tracks from 900 px away while they move along x by `path` px."""
+    seen = (face.shapes - face.shapes.mean(axis=1, keepdims=True)) @ face.rotations.transpose(0, 2, 1)
+    seen = 300 * seen / np.abs(seen).max()
+    images = (seen[..., :2] + path[:, None, None] * [1, 0]) / (1 + seen[..., 2:] / 900)
+    errors = np.random.default_rng(0).normal(0, noise, images.shape)
+    return seen, Tracks.from_arrays((np.array(PICTURE) - 1) / 2 + images + errors)
 
 
 @pytest.mark.slow
 def test_the_focal_length_of_given_cameras_with_a_moving_object() -> None:
     face = gallery.face(16, 60, degrees=40)
-    seen = (face.shapes - face.shapes.mean(axis=1, keepdims=True)) @ face.rotations.transpose(0, 2, 1)
-    seen = 300 * seen / np.abs(seen).max()
-    moved = seen.copy()
-    moved[..., 0] += np.linspace(-200, 400, 16)[:, None]
-    noise = np.random.default_rng(0).normal(0, 0.3, (16, 60, 2))
-    tracks = Tracks.from_arrays((np.array(PICTURE) - 1) / 2 + moved[..., :2] / (1 + moved[..., 2:] / 900) + noise)
+    _, tracks = moving_face(face, np.linspace(-200, 400, 16), noise=0.3)
     known = KnownCamera.from_arrays(face.rotations)
     solution = solve(tracks, cameras=known, settings=Settings(image_size=PICTURE, camera="perspective"))
     assert focal_error(solution.camera, 900) < 0.01
@@ -158,12 +154,7 @@ def test_the_focal_length_of_given_cameras_with_a_moving_object() -> None:
 @pytest.mark.slow
 def test_focal_length_and_shapes_of_an_object_that_moves_through_the_picture() -> None:
     face = gallery.face(30, 120, degrees=40)
-    seen = (face.shapes - face.shapes.mean(axis=1, keepdims=True)) @ face.rotations.transpose(0, 2, 1)
-    seen = 300 * seen / np.abs(seen).max()
-    moved = seen.copy()
-    moved[..., 0] += np.linspace(-75, 225, 30)[:, None]
-    noise = np.random.default_rng(0).normal(0, 0.1, (30, 120, 2))
-    tracks = Tracks.from_arrays((np.array(PICTURE) - 1) / 2 + moved[..., :2] / (1 + moved[..., 2:] / 900) + noise)
+    seen, tracks = moving_face(face, np.linspace(-75, 225, 30), noise=0.1)
     solution = solve(tracks, face.mesh, settings=Settings(image_size=PICTURE, surface="free"))
     assert focal_error(solution.camera, 900) < 0.1
     assert e3d_frame_scaled(solution.shapes, seen) < 0.03
