@@ -17,13 +17,14 @@ from pliant.service.problems import Refusal, from_validation, wrong_input
 from pliant.service.settings import ServiceSettings
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import Conflict, UnknownJob, UnknownUpload
-from pliant.worker.execution.solver_settings import solver_settings
 from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.sources import FilmSource, is_source, open_source, save_source
 from pliant.worker.films.tracker import TRACKING_OPTIONS, check_film, described, film_options
 from pliant.worker.formats import Limits, store_inputs
 from pliant.worker.formats.cost import estimated
+from pliant.worker.formats.isolated_reader import check_stored
 from pliant.worker.formats.point_names import one_line
+from pliant.worker.formats.solver_settings import solver_settings
 from pliant.worker.formats.tracks.film_tracks import tracks_options
 from pliant.worker.formats.tracks.pixels import FRACTIONS
 from pliant.worker.jobs.service import Jobs
@@ -113,7 +114,7 @@ def accept(
     if kept is not None:
         form, options, submission = kept.form, kept.options, replace(submission, name=name or kept.job.name)
     if kept is not None and kept.canonical is not None:
-        read = _read_again(kept.job.interpretation, options)
+        read = _read_again(kept.job.interpretation, kept.canonical, options, limits)
         return jobs.submit_once(
             kept.canonical, replace(submission, options=read.options), interpretation=read.interpretation
         )
@@ -165,7 +166,7 @@ def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept 
             part: File(
                 path, path.stat().st_size, hashlib.sha256(f"{id} {part}".encode()).hexdigest(), source.names[part]
             )
-            for part, path in (("film", source.film), ("region", source.region))
+            for part, path in (("film", source.film), ("region", None if options.region_polygon else source.region))
             if path is not None
         }
         had = {name: getattr(job.options, name) for name in OF_TRACKING if name not in options.model_fields_set}
@@ -262,17 +263,15 @@ def read_form(
     if form.texts.get("mesh", "").strip():
         files["mesh"] = form.texts["mesh"].strip()
     interpretation = store_inputs(**files, options=options, limits=limits, target=target)  # type: ignore[arg-type]
-    options = tracks_options(options, interpretation)
-    solver_settings(options)  # refuses options that contradict each other
-    return ReadInputs(interpretation, options)
+    return ReadInputs(interpretation, tracks_options(options, interpretation))
 
 
-def _read_again(interpretation: Interpretation, options: Options) -> ReadInputs:
+def _read_again(interpretation: Interpretation, canonical: Path, options: Options, limits: Limits) -> ReadInputs:
     """Return the interpretation of tracks that an earlier job has read, updated for the options of a new solve."""
     size = (interpretation.num_frames, interpretation.num_points)
     kinds_for(options, size=size)
     options = tracks_options(options, interpretation)
-    solver_settings(options)
+    check_stored(canonical, options, limits)
     estimate = estimated(*size, options, has_rotations=interpretation.has_rotations)
     return ReadInputs(interpretation.model_copy(update={"estimate": estimate}), options)
 

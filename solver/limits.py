@@ -11,6 +11,9 @@ LEARNED_FRAMES = 240
 cameras of the others follow by resection (`reconstruction.long_films`). More frames take longer where perspective is found, and the same
 number of iterations converges less: the error of a dance is .096 from all of its 264 frames and .089 from every second."""
 
+MAX_UNORDERED_FRAMES = 360
+"""Maximum number of photographs. Cameras and prior are learned from all of them, because photographs cannot be interpolated."""
+
 BLOCK_OBSERVATIONS = 10_000_000
 """Maximum number of frames times points solved at once: 3 GB. Blocks cost time, because they overlap and the weight of bending needs extra
 starts: a face of 50 × 40,000 takes 15 processor seconds in four blocks and 12 in one."""

@@ -12,14 +12,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from pliant.solver.agreement import check_agreement
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.blocks import needs_blocks, shapes_in_blocks
 from pliant.solver.reconstruction.cameras import Cameras, cameras_of
-from pliant.solver.reconstruction.observations import Observations, check_fit, monitored, observe
+from pliant.solver.reconstruction.observations import Observations, monitored, observe
 from pliant.solver.reconstruction.prior import Prior, prior_of
 from pliant.solver.reconstruction.shapes import shapes_from
+from pliant.solver.reconstruction.solution import in_world_unit
 from pliant.solver.reconstruction.start import Start, prepared, with_outlier_reason, with_outliers_rejected
 from pliant.solver.reconstruction.surface import isometric_verdict, solution_of, tries_isometry, with_verdict
 from pliant.solver.records import KnownCamera, Step, Tracks
@@ -70,7 +72,7 @@ def solve(
         The folder `scratch` is missing, cannot be written to, or has too little space.
     """
     settings = settings if settings is not None else Settings()
-    check_fit(tracks, mesh, cameras, settings)
+    check_agreement(tracks, mesh, cameras, settings)
     settings, why = resolved_order(tracks, settings)
     sheet = tries_isometry(cameras, settings)
     monitor = monitored(tracks, cameras, settings, on_step, should_stop, sheet=sheet)
@@ -111,9 +113,11 @@ def _solved(
         solution = shapes_in_blocks(
             tracks, cameras, prior, mesh, settings, monitor, seconds={"cameras": learning}, scratch=scratch
         )
-        return solution if verdict is None else with_verdict(solution, verdict, settings)
-    seconds = {"cameras": learning, "initialise": 0.0}
-    solution = shapes_from(_started(tracks, cameras, prior, mesh, settings, monitor, seconds), monitor, seconds=seconds)
+    else:
+        seconds = {"cameras": learning, "initialise": 0.0}
+        start = _started(tracks, cameras, prior, mesh, settings, monitor, seconds)
+        solution = shapes_from(start, monitor, seconds=seconds)
+    solution = in_world_unit(solution, observations.world_scale)
     return solution if verdict is None else with_verdict(solution, verdict, settings)
 
 

@@ -173,8 +173,8 @@ class KnownCamera:
     """Shape `(F, 3, 3)`, camera from world."""
 
     scales: Floats | None = None
-    """Shape `(F,)`; None estimates them if the camera model has scales. For a perspective camera, φ divided by the depth of the shape's
-    origin."""
+    """Shape `(F,)`, the tracks' unit per unit of the shapes; None estimates them if the camera model has scales. For a perspective
+    camera, φ divided by the depth of the shape's origin."""
 
     focal: float | None = None
     """φ, the tracks' unit; None takes it from the settings."""

@@ -187,13 +187,15 @@ def _from_polygon(given: ArrayLike, size: tuple[int, int]) -> Grey:
     far = np.flatnonzero(~(np.abs(corners) <= FARTHEST).all(axis=1))  # NaN as well
     if far.size:
         raise _wrong_polygon("the corner ({:g}, {:g})".format(*corners[far[0]]))
+    if np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)[1] < 1:
+        raise _wrong_polygon("corners on one line")
     mask = np.zeros(size[::-1], dtype=np.uint8)
     cv2.fillPoly(mask, [np.round(corners).astype(np.int32)], 255)
     return mask
 
 
 def _wrong_polygon(got: str) -> FilmError:
-    expected = f"a polygon of at least 3 corners with finite pixel coordinates up to {FARTHEST:,.0f}"
+    expected = f"a polygon of at least 3 corners around an area, with finite pixel coordinates up to {FARTHEST:,.0f}"
     return _refusal("wrong_polygon", expected, got, "Draw around the object to track.")
 
 

@@ -61,7 +61,7 @@ def preferences(
 
 
 Prefer = Annotated[str | None, Depends(preferences)]
-_WAIT = re.compile(r"\s*wait\s*=\s*(\d{1,6})\s*", re.IGNORECASE)
+_WAIT = re.compile(r"\s*wait\s*=\s*(\d{1,15})\s*", re.IGNORECASE)
 _SUBMIT_ERRORS = problems(400, 401, 403, 404, 408, 409, 413, 415, 422, 429, 503, 507)
 _LOCATION = {"Location": {"description": "The job's address.", "schema": {"type": "string"}}}
 

@@ -312,7 +312,8 @@ def _why(ran: list[Candidate], best: Candidate, settings: Settings) -> str:
 
 
 def _warnings(rotations: Floats) -> tuple[str, ...]:
-    if angles_between(rotations, rotations[:1]).max() >= MIN_CAMERA_TURN:
+    directions = rotations[:, 2]  # in the object's axes; a roll about the viewing direction shows no depth
+    if np.linalg.norm(directions - directions[0], axis=1).max() >= 2 * np.sin(MIN_CAMERA_TURN / 2):
         return ()
     return ("The camera hardly turns around the object: the tracks do not determine depth. Treat it as a guess.",)
 

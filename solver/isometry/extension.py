@@ -122,13 +122,18 @@ def extend(
     space[..., 2] = np.maximum(space[..., 2], nearest)
     off = np.linalg.norm(focal * space[..., :2] / space[..., 2:] + centre - tracks, axis=2)
     compared = seen & placed
-    limit = OUTLIER_DEVIATIONS * max(
-        float(np.median(off[compared])) / 1.1774, SPLINE_ERROR * float(images[known].std())
-    )
+    limit = OUTLIER_DEVIATIONS * max(float(np.median(off[compared])) / 1.1774, SPLINE_ERROR * _deviation(images, known))
     outliers: NDArray[np.bool_] = np.asarray(compared & (off > limit))
     own = compared & ~outliers
     rays = np.concatenate([(tracks - centre) / focal, np.ones((*seen.shape, 1))], axis=2)
     return Extended(np.where(own[..., None], rays * space[..., 2:], space), outliers, placed)
+
+
+def _deviation(images: Floats, known: NDArray[np.bool_]) -> float:
+    """Return the standard deviation per coordinate of the anchors' images `(F, A, 2)` about the mean of their frame."""
+    count = np.maximum(known.sum(axis=1), 1)[:, None, None]
+    mean = np.where(known[..., None], images, 0.0).sum(axis=1, keepdims=True) / count
+    return float((images - mean)[known].std())
 
 
 def spline(source: Floats, values: Floats, target: Floats) -> Floats:
@@ -156,7 +161,8 @@ def _placed(
     found = np.full((*seen.shape, 2), np.nan)
     for frame in np.flatnonzero(known.sum(axis=1) >= MIN_ANCHORS):
         source = images[frame, known[frame]]
-        middle, size = source.mean(axis=0), max(float(source.std()), np.finfo(np.float64).tiny)
+        middle = source.mean(axis=0)
+        size = max(float((source - middle).std()), np.finfo(np.float64).tiny)
         target = (tracks[frame, seen[frame]] - middle) / size
         found[frame, seen[frame]] = spline((source - middle) / size, template[known[frame]], target)
     place = np.full((seen.shape[1], 2), np.nan)

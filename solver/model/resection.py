@@ -148,10 +148,18 @@ class Poses:
         return Poses(*(np.where(better.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in pairs))
 
 
+def rotations_between(used: NDArray[np.intp], rotations: Floats, frames: int) -> Floats:
+    """Return rotations of all frames, interpolated between the frames `used` on the shortest path, shape `(F, 3, 3)`."""
+    path = Slerp(used, Rotation.from_matrix(rotations))
+    found: Floats = path(np.clip(np.arange(frames), used[0], used[-1])).as_matrix()
+    found[used] = rotations
+    return found
+
+
 def interpolated(used: NDArray[np.intp], rotations: Floats, scales: Floats, modes: Floats, num_frames: int) -> Poses:
     """Return the poses of all frames of a film, interpolated between those of the frames used."""
     at = np.clip(np.arange(num_frames), used[0], used[-1])
-    turned = Slerp(used, Rotation.from_matrix(rotations))(at).as_matrix()
+    turned = rotations_between(used, rotations, num_frames)
     coefficients = np.zeros((num_frames, modes.shape[1]))
     for number, mode in enumerate(modes.T):
         coefficients[:, number] = np.interp(at, used, mode)

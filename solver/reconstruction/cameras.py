@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.agreement import check_agreement, seen_again
 from pliant.solver.cameras import estimation
 from pliant.solver.cameras.estimation import CameraEstimate, given_cameras
 from pliant.solver.cameras.planar_ambiguity import is_planar
@@ -14,7 +15,7 @@ from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.monitor import Monitor, enter
 from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.long_films import extended
-from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, check_fit, monitored, observe
+from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, monitored, observe
 from pliant.solver.records import MIN_POINTS, Camera, Floats, KnownCamera, Step, Tracks, read_only
 from pliant.solver.refinement.covariance_learning import LearningData, learn_covariance
 from pliant.solver.refinement.depth_rounds import settled
@@ -22,7 +23,6 @@ from pliant.solver.refinement.joint_refinement import refine_cameras
 from pliant.solver.refinement.observed import Observed, cross_fitted
 from pliant.solver.settings import Settings
 from pliant.solver.stages import stage_of
-from pliant.solver.tracks.completion import seen_again
 from pliant.solver.tracks.frame_order import resolved_order
 from pliant.solver.tracks.frame_selection import evenly_spread, informative_frames
 from pliant.solver.tracks.noise import OUTLIER_SHARE
@@ -62,7 +62,7 @@ class Cameras:
         return f"<Cameras of {len(self.camera.rotations)} frames, {lens}>"
 
     def project(self, shapes: Floats) -> Floats:
-        """Return the image, shape `(F, P, 2)`, of shapes `(F, P, 3)`, both in the tracks' unit."""
+        """Return the image, shape `(F, P, 2)`, of shapes `(F, P, 3)`, both in the tracks' unit unless scales were given."""
         return self.camera.project(shapes)
 
 
@@ -99,7 +99,7 @@ def estimate_cameras(
         Settings and tracks contradict each other.
     """
     settings = settings if settings is not None else Settings()
-    check_fit(tracks, None, known, settings)
+    check_agreement(tracks, None, known, settings)
     settings, _ = resolved_order(tracks, settings)
     observations = observe(tracks, known, settings)
     monitor = monitored(tracks, known, settings, on_step, should_stop, only=STAGES)
@@ -209,11 +209,12 @@ def camera_of(estimate: CameraEstimate, observations: Observations) -> Camera:
     normalized, view = observations.normalized, estimate.perspective
     camera = Camera(
         np.array(estimate.rotations, dtype=np.float64),
-        np.array(estimate.scales, dtype=np.float64),
+        np.array(estimate.scales, dtype=np.float64) * observations.world_scale,
         normalized.centroid + normalized.unit * np.asarray(estimate.translations),
+        y_up=observations.settings.y_up,
     )
     if view is not None:
-        camera = replace(camera, principal_point=np.array(view.principal_point), y_up=view.signs[0] < 0)
+        camera = replace(camera, principal_point=np.array(view.principal_point))
     if view is not None and view.bends:
         focal = normalized.unit / abs(view.curvature)
         camera = replace(camera, focal=focal, focal_std=view.focal_std(normalized.unit))

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.descent import Descent
-from pliant.solver.errors import InvalidInput, InvalidSettings
+from pliant.solver.errors import InvalidInput
 from pliant.solver.limits import frame_chunks
-from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
-from pliant.solver.records import KnownCamera, Step, Tracks
+from pliant.solver.records import Floats, KnownCamera, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.stages import iteration_seconds, planned, unseen_frames
 from pliant.solver.tracks.normalization import Normalized, normalize, relative
@@ -40,7 +39,11 @@ class Observations:
     """Lens under perspective camera models; None under orthographic ones."""
 
     known: KnownCamera | None
-    """Given cameras; None if they are estimated."""
+    """Given cameras, their scales divided by `world_scale`; None if they are estimated."""
+
+    world_scale: float = 1.0
+    """Geometric mean of the given scales: units of the tracks per unit of the world. Inside the solver it is 1, so that the constants in
+    normalized units do not depend on the unit of the given cameras."""
 
     @property
     def turning(self) -> bool:
@@ -50,11 +53,14 @@ class Observations:
     def without(self, outliers: NDArray[np.bool_]) -> Observations:
         """Return the observations with `outliers`, shape `(F, P)`, hidden, so that they do not affect unit and centroids."""
         kept = normalize(Tracks.from_arrays(self.tracks.points, np.where(outliers, 0.0, self.tracks.visible)))
-        return replace(self, normalized=kept, lens=given_lens(self.tracks, kept, self.settings, self.known))
+        return replace(self, normalized=kept, lens=given_lens(kept, self.settings, self.known))
 
     def with_all(self) -> Observations:
         """Return all observations, including those hidden by `without`, in the same unit and about the same centroids."""
-        return replace(self, normalized=in_units_of(self.normalized, self.tracks))
+        seen = np.minimum(
+            self.tracks.visible, self.normalized.full_confidence
+        )  # the most confident one may have been an outlier
+        return replace(self, normalized=in_units_of(self.normalized, Tracks(self.tracks.points, seen)))
 
     def without_points(self) -> Observations:
         """Return a copy without the normalized points, which still serves `of` for other tracks of the same frames."""
@@ -75,7 +81,7 @@ class Observations:
         if known is not None:
             scales = None if known.scales is None else known.scales[used]
             known = replace(known, rotations=known.rotations[used], scales=scales)
-        return Observations(tracks, normalized, self.settings, lens, known)
+        return replace(self, tracks=tracks, normalized=normalized, lens=lens, known=known)
 
     def of(self, tracks: Tracks) -> Observations:
         """Return observations of other tracks of the same frames, in this unit and about these centroids.
@@ -95,13 +101,19 @@ class Observations:
         return replace(self, tracks=tracks, normalized=in_units_of(self.normalized, tracks))
 
 
+def mean_scale(scales: Floats) -> float:
+    """Return the geometric mean of positive scales `(F,)`."""
+    return float(np.exp(np.log(scales).mean()))
+
+
 def in_units_of(normalized: Normalized, tracks: Tracks) -> Normalized:
     """Return tracks in the unit and about the centroids of `normalized`."""
     points = np.zeros(tracks.points.shape)
     for some in frame_chunks(tracks.num_frames, tracks.num_points):
         placed = (tracks.points[some] - normalized.centroid[some, None]) / normalized.unit
         points[some] = np.where(tracks.visible[some, :, None] > 0, placed, 0.0)
-    return replace(normalized, points=points, visible=relative(tracks.visible, normalized.full_confidence))
+    full = max(normalized.full_confidence, float(tracks.visible.max()))
+    return replace(normalized, points=points, visible=relative(tracks.visible, full), full_confidence=full)
 
 
 def observe(tracks: Tracks, known: KnownCamera | None, settings: Settings) -> Observations:
@@ -113,40 +125,11 @@ def observe(tracks: Tracks, known: KnownCamera | None, settings: Settings) -> Ob
         No observation is visible, or the tracks contradict the lens.
     """
     normalized = normalize(tracks)
-    return Observations(tracks, normalized, settings, given_lens(tracks, normalized, settings, known), known)
-
-
-def check_fit(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None, settings: Settings) -> None:
-    """Check that mesh and given cameras match the tracks, and the settings the mesh.
-
-    Raises
-    ------
-    InvalidInput
-        Number of vertices (code `mesh_mismatch`) or of cameras (`camera_mismatch`).
-    InvalidSettings
-        `laplacian="grid8"` with a mesh that is not a grid, or `camera="orthographic"` with given scales that are not 1.
-    """
-    if mesh is not None and mesh.num_points != tracks.num_points:
-        raise InvalidInput(
-            "mesh_mismatch", field="mesh", expected=f"{tracks.num_points} vertices, one for each point of the tracks",
-            got=f"{mesh.num_points}", hint="Vertex i of the mesh must be point i of the tracks.",
-        )  # fmt: skip
-    if mesh is not None and settings.laplacian == "grid8" and mesh.grid is None and len(mesh.faces) > 0:
-        raise InvalidSettings(
-            "invalid_option", field="options.laplacian", expected="a mesh that is a pixel grid", got="faces only",
-            hint="Use laplacian auto, uniform or cotangent, or give the points as a grid.",
-        )  # fmt: skip
-    if cameras is not None and len(cameras.rotations) != tracks.num_frames:
-        raise InvalidInput(
-            "camera_mismatch", field="rotations", expected=f"{tracks.num_frames} rotations, one for each frame of the tracks",
-            got=f"{len(cameras.rotations)}", hint="Pass one camera per frame, in the order of the frames.",
-        )  # fmt: skip
-    scales = None if cameras is None else cameras.scales
-    if scales is not None and settings.camera == "orthographic" and not np.allclose(scales, 1):
-        raise InvalidSettings(
-            "invalid_option", field="options.camera", expected="auto, scaled_orthographic or perspective beside given scales",
-            got="'orthographic'", hint="Orthographic cameras have scale 1. Choose another model, or leave the scales out.",
-        )  # fmt: skip
+    lens, world_scale = given_lens(normalized, settings, known), 1.0
+    if known is not None and known.scales is not None:
+        world_scale = mean_scale(known.scales)
+        known = replace(known, scales=known.scales / world_scale)
+    return Observations(tracks, normalized, settings, lens, known, world_scale)
 
 
 def monitored(

@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.cameras.lens import given_lens
 from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.errors import InvalidInput
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import pulses_to
-from pliant.solver.reconstruction.cameras import Cameras, estimate_cameras
+from pliant.solver.reconstruction.cameras import STAGES, Cameras, cameras_of
 from pliant.solver.reconstruction.observations import OnStep, ShouldStop, monitored
 from pliant.solver.records import Floats, KnownCamera, Step, Tracks
 from pliant.solver.refinement.covariance_learning import learn_covariance
@@ -39,15 +40,20 @@ class Prior:
     # For the following stages only, and without docstrings, so that they are not in the reference.
     normalized: ShapeCovariance  # the covariance in normalized units
     estimate: CameraEstimate  # the cameras that the prior was learned with
+    world_scale: float  # the tracks' unit per unit of the shapes
 
     def __repr__(self) -> str:
         frames, modes = self.normalized.modes.shape
         return f"<Prior of {frames} frames: {modes} modes, noise {self.noise_std:.3g}>"
 
     @property
+    def _world_unit(self) -> float:
+        return self.unit / self.world_scale
+
+    @property
     def mean_covariance(self) -> Floats:
-        """A₀, shape `(3, 3)`, in squared units of the tracks."""
-        return np.asarray(self.normalized.mean_covariance * self.unit**2)
+        """A₀, shape `(3, 3)`, in squared units of the shapes."""
+        return np.asarray(self.normalized.mean_covariance * self._world_unit**2)
 
     @property
     def axis_covariance(self) -> Floats:
@@ -56,18 +62,18 @@ class Prior:
 
     @property
     def modes(self) -> Floats:
-        """L, shape `(F, k)`, in the tracks' unit: standard deviation per frame of the deformation that each mode explains."""
-        return np.asarray(self.normalized.modes * self.unit)
+        """L, shape `(F, k)`, in the shapes' unit: standard deviation per frame of the deformation that each mode explains."""
+        return np.asarray(self.normalized.modes * self._world_unit)
 
     @property
     def walk_variance(self) -> float:
-        """τ, in squared units of the tracks."""
-        return float(self.normalized.walk_variance * self.unit**2)
+        """τ, in squared units of the shapes."""
+        return float(self.normalized.walk_variance * self._world_unit**2)
 
     @property
     def covariance(self) -> Floats:
-        """C, shape `(F, F)`, in squared units of the tracks."""
-        return np.asarray(self.normalized.over_frames() * self.unit**2)
+        """C, shape `(F, F)`, in squared units of the shapes."""
+        return np.asarray(self.normalized.over_frames() * self._world_unit**2)
 
     @property
     def noise_std(self) -> float:
@@ -112,7 +118,7 @@ def learn_prior(
             hint="Call estimate_cameras with these tracks, or give rotations as a KnownCamera.",
         )  # fmt: skip
     if cameras.data is None:
-        cameras = _with_learning_data(tracks, cameras, should_stop)
+        cameras = _with_learning_data(cameras, should_stop)
     observations = cameras.observations
     monitor = monitored(
         tracks, observations.known, observations.settings, on_step, should_stop, only=("model_order", "covariance")
@@ -123,23 +129,33 @@ def learn_prior(
     return found
 
 
-def _with_learning_data(tracks: Tracks, cameras: Cameras, should_stop: ShouldStop | None) -> Cameras:
+def _with_learning_data(cameras: Cameras, should_stop: ShouldStop | None) -> Cameras:
     """Return the cameras with the data for learning the prior, which estimates for other priors lack."""
     settings = replace(
         cameras.observations.settings, method="robust", preset="auto", prior="gaussian", focal=None, field_of_view=None
     )
-    camera = cameras.camera
+    camera, observations = cameras.camera, cameras.observations
     centre = None if camera.focal is None else (float(camera.principal_point[0]), float(camera.principal_point[1]))
-    known = KnownCamera(camera.rotations, camera.scales, camera.focal, centre)
-    return estimate_cameras(tracks, known, settings=settings, should_stop=should_stop)
+    known = KnownCamera(camera.rotations, camera.scales / observations.world_scale, camera.focal, centre)
+    lens = given_lens(observations.normalized, settings, known)
+    monitor = monitored(observations.tracks, known, settings, None, should_stop, only=STAGES)
+    with pulses_to(monitor.pulse):
+        return cameras_of(replace(observations, settings=settings, known=known, lens=lens), monitor)
 
 
 def prior_of(cameras: Cameras, monitor: Monitor, *, seed: int) -> Prior:
     """Return the prior of cameras that have their learning data."""
     assert cameras.data is not None
     estimate, covariance = learn_covariance(cameras.estimate, cameras.data, seed=seed, should_stop=monitor)
-    unit = cameras.observations.normalized.unit
-    return Prior(unit, estimate.reasons["modes"], monitor.stopped, covariance, estimate)
+    observations = cameras.observations
+    return Prior(
+        observations.normalized.unit,
+        estimate.reasons["modes"],
+        monitor.stopped,
+        covariance,
+        estimate,
+        observations.world_scale,
+    )
 
 
 def estimate_with(cameras: Cameras, prior: Prior) -> CameraEstimate:

@@ -120,7 +120,9 @@ def _finished(
     choices = replace(choices, warnings=(*choices.warnings, *unused))
     monitor.enter("finish")
     monitor()
-    solution = finish(problem, history, outcome, normalized=normalized, estimate=estimate, choices=choices)
+    solution = finish(
+        problem, history, outcome, normalized=normalized, estimate=estimate, choices=choices, y_up=start.settings.y_up
+    )
     history[-1] = history[-1].summary()
     if estimate.perspective is not None:
         centre = start.kept if problem.moving else None

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.energy.objective import residuals_of
 from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import largest_weight
 from pliant.solver.limits import frame_chunks
+from pliant.solver.pulse import pulse
 from pliant.solver.records import Camera, Choices, Floats, read_only
 from pliant.solver.shapes.state import State
 from pliant.solver.solution import Outcome, Solution, Trace
@@ -22,8 +25,9 @@ def finish(
     normalized: Normalized,
     estimate: CameraEstimate,
     choices: Choices,
+    y_up: bool,
 ) -> Solution:
-    """Convert the last state to a Solution in the tracks' unit, with orthographic cameras."""
+    """Convert the last state to a Solution in the tracks' unit, with orthographic cameras; `y_up` as in the settings."""
     state, unit = history[-1], normalized.unit
     top = largest_weight(problem.loss, problem.weights.robust_scale)
     frames, _, points = state.shapes.shape
@@ -39,6 +43,7 @@ def finish(
         np.array(estimate.rotations, dtype=np.float64),
         np.array(estimate.scales, dtype=np.float64),
         normalized.centroid + unit * state.translations,
+        y_up=y_up,
     )
     trace = Trace(
         np.array([s.objective for s in history]),
@@ -49,3 +54,19 @@ def finish(
     for array in arrays:
         read_only(array)
     return Solution(shapes, camera, residual, trust, trace, outcome, choices, {})
+
+
+def in_world_unit(solution: Solution, world_scale: float) -> Solution:
+    """Return the solution with shapes in the unit of given cameras, whose mean scale is `world_scale`; its arrays are changed in place."""
+    if world_scale == 1:
+        return solution
+    for array in (solution.shapes, solution.shapes_std):
+        if array is not None:
+            array.flags.writeable = True
+            for frame in array:
+                pulse()
+                frame /= world_scale
+            read_only(array)
+    scales = solution.camera.scales * world_scale
+    read_only(scales)
+    return replace(solution, camera=replace(solution.camera, scales=scales))

@@ -6,13 +6,15 @@ import time
 from pathlib import Path
 
 import numpy as np
+from pliant.solver.agreement import check_agreement
 from pliant.solver.mesh import Mesh
 from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.blocks import needs_blocks, shapes_in_blocks
 from pliant.solver.reconstruction.cameras import Cameras
-from pliant.solver.reconstruction.observations import OnStep, ShouldStop, check_fit, monitored
+from pliant.solver.reconstruction.observations import OnStep, ShouldStop, monitored
 from pliant.solver.reconstruction.prior import Prior, changes_of
 from pliant.solver.reconstruction.shapes import shapes_from
+from pliant.solver.reconstruction.solution import in_world_unit
 from pliant.solver.reconstruction.start import (
     check_shapes,
     prepared,
@@ -79,15 +81,17 @@ def solve_shapes(
     first = None if start is None else np.asarray(start.shapes if isinstance(start, Solution) else start, dtype=float)
     if first is not None:
         check_shapes(first, tracks)
+        first = first * observations.world_scale
     settings = settings if settings is not None else observations.settings
-    check_fit(tracks, mesh, None, settings)
+    check_agreement(tracks, mesh, None, settings)
     settings = without_learned_prior(settings) if prior is None else settings
     monitor = monitored(tracks, None, settings, on_step, should_stop, only=("shapes", "finish", "trust"))
     with pulses_to(monitor.pulse):
         if needs_blocks(tracks, settings):
-            return shapes_in_blocks(
+            solution = shapes_in_blocks(
                 tracks, cameras, prior, mesh, settings, monitor, seconds={}, start=first, scratch=scratch
             )
+            return in_world_unit(solution, observations.world_scale)
         begun = prepared(tracks, cameras, prior, mesh, settings, should_stop=monitor)
         begun = with_outlier_reason(with_outliers_rejected(begun, monitor))
         if first is not None:
@@ -97,4 +101,5 @@ def solve_shapes(
             changes = changes_of(tracks, cameras, prior, seed=settings.seed, should_stop=monitor)
         seconds, starts = {"initialise": time.perf_counter() - began}, [begun]
         del begun, first  # so that `shapes_from` has the only reference and can release the first state
-        return shapes_from(starts.pop(), monitor, seconds=seconds, changes=changes)
+        solution = shapes_from(starts.pop(), monitor, seconds=seconds, changes=changes)
+        return in_world_unit(solution, observations.world_scale)

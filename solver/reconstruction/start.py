@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.agreement import check_agreement
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import orthographic
 from pliant.solver.energy.problem import Problem
@@ -15,7 +16,7 @@ from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.cameras import Cameras
-from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, check_fit, monitored
+from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, monitored
 from pliant.solver.reconstruction.prior import Prior, estimate_with
 from pliant.solver.records import Choices, Floats, Step, Tracks
 from pliant.solver.settings import Settings
@@ -139,7 +140,7 @@ def prepared(
     """
     observations = cameras.observations.of(tracks)
     settings = observations.settings if settings is None else settings
-    check_fit(tracks, mesh, None, settings)
+    check_agreement(tracks, mesh, None, settings)
     if prior is None:
         estimate, covariance = cameras.estimate, None
         settings = without_learned_prior(settings)

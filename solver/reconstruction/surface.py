@@ -6,7 +6,6 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from pliant.solver.errors import InvalidSettings
 from pliant.solver.evaluation.trust import Verdict
 from pliant.solver.isometry.surface import IsometricVerdict, isometric_surface, sheetlike
 from pliant.solver.monitor import Monitor
@@ -38,18 +37,7 @@ def _knows_lens(settings: Settings) -> bool:
 def isometric_verdict(
     tracks: Tracks, cameras: KnownCamera | None, settings: Settings, monitor: Monitor
 ) -> IsometricVerdict | None:
-    """Return the verdict on whether the surface is isometric; None if the question does not arise.
-
-    Raises
-    ------
-    InvalidSettings
-        An isometric surface is required, but rotations are given.
-    """
-    if settings.surface == "isometric" and cameras is not None:
-        raise InvalidSettings(
-            "invalid_option", field="options.surface", expected="auto or free where rotations are given", got="'isometric'",
-            hint="Omit the rotations: an isometric surface determines its own cameras.",
-        )  # fmt: skip
+    """Return the verdict on whether the surface is isometric; None if the question does not arise."""
     if not tries_isometry(cameras, settings):
         return _untested(tracks) if settings.surface == "auto" and _may_be_isometric(cameras, settings) else None
     return isometric_surface(

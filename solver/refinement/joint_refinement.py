@@ -17,6 +17,7 @@ from pliant.solver.cameras.perspective import mirrored
 from pliant.solver.model import full_mode_covariance
 from pliant.solver.model.expectation_maximisation import MAX_MODES
 from pliant.solver.model.model_order import ModelOrder, select_model_order
+from pliant.solver.model.resection import rotations_between
 from pliant.solver.model.so3 import MIRROR, angles_between
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only
@@ -29,7 +30,7 @@ from pliant.solver.refinement.learned import Learned, learned_at, refined, scene
 from pliant.solver.refinement.observed import Moments, Observed, on_observations
 from pliant.solver.refinement.starts import best_candidate, best_start
 from pliant.solver.stages import REFINEMENT_UNITS, UNITS_PER_START
-from pliant.solver.tracks.frame_selection import between, rotations_between
+from pliant.solver.tracks.frame_selection import between
 from pliant.solver.tracks.normalization import Normalized
 
 REFINEMENT_ROUNDS = 5

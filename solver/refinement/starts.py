@@ -93,11 +93,12 @@ def best_candidate(
     The camera-motion prior prefers rotations that are too small, whatever their direction. Only at comparable depths can it
     distinguish rotation of the object from deformation.
     """
+    with_scales = bool((found.scales != 1).any())
     for candidate in estimate.candidates:
         if should_stop is not None and should_stop():
             break
         other = refined(
-            gram, candidate.rotations[used], found.scales, with_scales=False, rounds=CANDIDATE_ROUNDS,
+            gram, candidate.rotations[used], found.scales, with_scales=with_scales, rounds=CANDIDATE_ROUNDS,
             model_order=model_order, should_stop=should_stop,
         )  # fmt: skip
         if not np.isfinite(other.energy):

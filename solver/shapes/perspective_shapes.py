@@ -64,7 +64,7 @@ def seen_in_perspective(
     Tracks were corrected with depths relative to the mean of the points `kept`, but shapes may be centred on the mean of all points. With c
     the difference in depth, 1 + κ(z + c) = (1 + κc)(1 + κz/(1 + κc)), so scales and translations are divided by 1 + κc.
     """
-    camera = replace(solution.camera, principal_point=np.array(view.principal_point), y_up=view.signs[0] < 0)
+    camera = replace(solution.camera, principal_point=np.array(view.principal_point))
     if not view.bends:
         read_only(camera.principal_point)
         return replace(solution, camera=camera)

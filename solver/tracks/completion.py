@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.errors import InvalidInput
-from pliant.solver.records import MIN_POINTS, Floats
+from pliant.solver.agreement import check_seen
+from pliant.solver.records import Floats
 from pliant.solver.threads import SMALLEST, over_ranges
 from pliant.solver.tracks.noise import weighted_median
 from pliant.solver.tracks.normalization import Normalized
@@ -125,12 +125,7 @@ def complete(
     """
     random = np.random.default_rng(seed)
     chosen = choose_points(normalized.visible, random)
-    again = seen_again(normalized.visible)
-    if again < MIN_POINTS:
-        raise InvalidInput(
-            "too_little_seen", field="visibility", expected=f"at least {MIN_POINTS} points that are visible in two or more frames",
-            got=f"{again}", hint="Check that the visibility is not inverted, and that a point has the same index in every frame.",
-        )  # fmt: skip
+    check_seen(normalized.visible)
     points, weight = normalized.points[:, chosen], normalized.visible[:, chosen]
     basis, spread, scale = fit_basis(points, weight, random, rank, should_stop=should_stop)
     outliers = fill(points, weight, basis, spread, scale)[1]
@@ -138,11 +133,6 @@ def complete(
     filling = None if clean else Filling(basis, spread, scale)
     gram, translations, sample = _carry(normalized, filling, chosen, should_stop)
     return Completed(gram, sample, translations, 0 if clean else basis.shape[2], outliers, filling, chosen)
-
-
-def seen_again(visible: Floats) -> int:
-    """Return the number of points that are visible in two or more frames."""
-    return int(((visible > 0).sum(axis=0) >= 2).sum())
 
 
 def choose_points(visible: NDArray[np.floating[Any]], random: np.random.Generator) -> NDArray[np.intp]:

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.errors import InvalidSettings
+from pliant.solver.limits import MAX_UNORDERED_FRAMES
 from pliant.solver.records import Camera, Floats, KnownCamera, Tracks, read_only
 from pliant.solver.settings import Settings
 from pliant.solver.solution import Solution
@@ -31,23 +31,9 @@ with up to 20 % gross outliers have at most .40, photographs and shuffled films 
 MAX_PAIRS, MAX_POINTS = 200, 2000
 """Maximum numbers of frame pairs and of points compared; they bound time and memory."""
 
-MAX_UNORDERED_FRAMES = 360
-"""Maximum number of photographs. Cameras and prior are learned from all of them, because photographs cannot be interpolated."""
-
 
 def resolved_order(tracks: Tracks, settings: Settings) -> tuple[Settings, str]:
-    """Return the settings with `order` resolved to `film` or `any`, and the reason as a sentence.
-
-    Raises
-    ------
-    InvalidSettings
-        `any` with more than `MAX_UNORDERED_FRAMES` frames.
-    """
-    if settings.order == "any" and tracks.num_frames > MAX_UNORDERED_FRAMES:
-        raise InvalidSettings(
-            "invalid_option", field="options.order", expected=f"film or auto with more than {MAX_UNORDERED_FRAMES} frames",
-            got=f"'any' with {tracks.num_frames}", hint="Select some of the photographs with the option frames.",
-        )  # fmt: skip
+    """Return the settings with `order` resolved to `film` or `any`, and the reason as a sentence."""
     if settings.order != "auto":
         return settings, f"Frames in {'the order of a film' if settings.order == 'film' else 'no order'}, as set."
     share = step_share(tracks)
@@ -118,7 +104,7 @@ def _typical(points: Floats, weight: Floats, pairs: Iterable[tuple[int, int]]) -
 
 def content_order(between: Floats) -> NDArray[np.intp]:
     """Return an order by content: first the frame that differs most from the others, then always the most similar remaining one."""
-    finite = np.where(np.isfinite(between), between, 2 * np.max(between, where=np.isfinite(between), initial=1.0))
+    finite = np.where(np.isfinite(between), between, 2 * np.max(between, where=np.isfinite(between), initial=0.0))
     order = [int(finite.sum(axis=1).argmax())]
     left = np.ones(len(finite), dtype=bool)
     left[order[0]] = False

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.records import Floats
-from scipy.spatial.transform import Rotation, Slerp
 
 
 def informative_frames(visible: Floats) -> NDArray[np.bool_]:
@@ -29,11 +28,3 @@ def of_frames(gram: Floats, used: NDArray[np.intp]) -> Floats:
 def between(used: NDArray[np.intp], values: Floats, frames: int) -> Floats:
     """Return values of all frames, linearly interpolated between the `values (F', n)` of the frames `used`, shape `(F, n)`."""
     return np.stack([np.interp(np.arange(frames), used, each) for each in values.T], axis=1)
-
-
-def rotations_between(used: NDArray[np.intp], rotations: Floats, frames: int) -> Floats:
-    """Return rotations of all frames, interpolated between the frames `used` on the shortest path, shape `(F, 3, 3)`."""
-    path = Slerp(used, Rotation.from_matrix(rotations))
-    found: Floats = path(np.clip(np.arange(frames), used[0], used[-1])).as_matrix()
-    found[used] = rotations
-    return found

@@ -254,6 +254,26 @@ def test_a_rerun_of_a_film_keeps_its_tracking_options(running: Running, http: ht
     assert Job.model_validate_json(http.post("/v1/jobs", files=parts).content).options.region_polygon is None
 
 
+def test_a_polygon_replaces_the_region_of_a_film_that_is_solved_again(
+    running: Running, http: httpx.Client, film: bytes
+) -> None:
+    first = send(http, film, region=mask(), options=QUICK)
+    assert work(running, first.id).status is Status.SUCCEEDED
+    corners = [[20, 20], [70, 20], [70, 55], [20, 55]]
+    changed = {"inputs_of": (None, first.id), "options": (None, json.dumps({**QUICK, "region_polygon": corners}))}
+    again = Job.model_validate_json(http.post("/v1/jobs", files=changed).content)
+    assert again.options.region_polygon is not None
+    assert work(running, again.id).status is Status.SUCCEEDED
+
+
+def test_more_frames_than_the_film_has_cannot_be_required_of_a_point(
+    running: Running, http: httpx.Client, film: bytes
+) -> None:
+    refused(running, http, parts(film, options={"min_seen": 11}), "nothing_visible", "options.min_seen")
+    straight = [[10, 10], [20, 20], [30, 30]]
+    refused(running, http, parts(film, options={"region_polygon": straight}), "wrong_polygon", "options.region_polygon")
+
+
 @forked
 def test_client_and_command_line_send_films(running: Running, film: bytes, tmp_path: Path) -> None:
     path, region = tmp_path / "film.mp4", tmp_path / "mask.png"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +54,8 @@ def assert_same(one: Solution, other: Solution) -> None:
     np.testing.assert_array_equal(one.camera.rotations, other.camera.rotations)
     np.testing.assert_array_equal(one.trace.objective, other.trace.objective)
     assert one.outcome is other.outcome
-    assert {**one.choices.reasons, "order": ""} == {**other.choices.reasons, "order": ""}
+    of_solve = {"order": "", "surface": ""}  # which the stages do not decide
+    assert one.choices.reasons | of_solve == other.choices.reasons | of_solve
 
 
 def composed(tracks: Tracks, known: KnownCamera | None, settings: Settings) -> Solution:
@@ -226,3 +228,60 @@ def test_mismatched_inputs_are_rejected(cameras: Cameras, prior: Prior, solution
         assert caught.value.field == field
     with pytest.raises(InvalidSettings, match="with a learned prior"):
         solve_shapes(tracks, cameras, prior, settings=Settings(prior="smooth"))
+
+
+@pytest.mark.parametrize("prior", ["gaussian", "smooth"])
+def test_the_unit_of_given_scales_is_that_of_the_shapes_only(prior: str) -> None:
+    settings = Settings(prior=prior)  # type: ignore[arg-type]
+    changing = np.linspace(0.9, 1.1, len(MADE.rotations))
+
+    def solved(unit: float) -> tuple[Solution, Cameras]:
+        known = KnownCamera.from_arrays(MADE.rotations, changing / unit)
+        return solve(MADE.tracks, MADE.mesh, cameras=known, settings=settings), estimate_cameras(
+            MADE.tracks, known, settings=settings
+        )
+
+    (one, cameras), (other, again) = solved(1.0), solved(1000.0)
+    np.testing.assert_allclose(other.shapes, 1000 * one.shapes, atol=1e-4 * 1000 * np.abs(one.shapes).max())
+    np.testing.assert_allclose(other.camera.project(other.shapes), one.camera.project(one.shapes), atol=1e-2)
+    np.testing.assert_allclose(other.camera.scales, changing / 1000)
+    np.testing.assert_allclose(again.camera.scales, changing / 1000)
+    if prior == "gaussian":
+        assert one.shapes_std is not None
+        assert other.shapes_std is not None
+        np.testing.assert_allclose(other.shapes_std, 1000 * one.shapes_std, rtol=1e-4)
+    first, second = (learn_prior(MADE.tracks, each) for each in (cameras, again))
+    np.testing.assert_allclose(second.covariance, 1e6 * first.covariance, rtol=1e-4)
+    assert second.noise_std == pytest.approx(first.noise_std)
+    start = solve_shapes(MADE.tracks, again, second, MADE.mesh, settings=Settings(), start=other)
+    fresh = solve_shapes(MADE.tracks, again, second, MADE.mesh, settings=Settings())
+    np.testing.assert_allclose(start.shapes, fresh.shapes, atol=2e-3 * np.abs(fresh.shapes).max())
+
+
+@pytest.mark.parametrize("camera", ["auto", "scaled_orthographic"])
+def test_depths_point_away_from_the_camera_whatever_the_direction_of_y(camera: str) -> None:
+    settings = Settings(camera=camera, prior="smooth")  # type: ignore[arg-type]
+    known = KnownCamera.from_arrays(MADE.rotations)
+    down = solve(MADE.tracks, MADE.mesh, cameras=known, settings=settings)
+    turned = np.diag([1.0, -1.0, -1.0])
+    mirrored = Tracks.from_arrays(MADE.tracks.points * [1, -1], MADE.tracks.visible)
+    up = solve(
+        mirrored,
+        MADE.mesh,
+        cameras=KnownCamera.from_arrays(turned @ MADE.rotations),
+        settings=replace(settings, y_up=True),
+    )
+    assert up.camera.y_up
+    np.testing.assert_allclose(up.camera.depths(up.shapes), down.camera.depths(down.shapes), atol=1e-3)
+
+
+def test_the_most_confident_observation_counts_as_one() -> None:
+    cameras = estimate_cameras(MADE.tracks, KNOWN, settings=Settings(prior="smooth"))
+    surer = Tracks.from_arrays(MADE.tracks.points, np.where(np.arange(40) == 3, 1.0, 0.2) + np.zeros((8, 1)))
+    fainter = Tracks.from_arrays(MADE.tracks.points, 0.1 * surer.visible)
+    of_fainter = estimate_cameras(fainter, KNOWN, settings=Settings(prior="smooth"))
+    for observations in (cameras.observations.of(surer), of_fainter.observations.of(surer)):
+        assert observations.normalized.visible.max() == 1.0
+    shown = observations.without(surer.visible == 1.0)
+    assert shown.normalized.visible.max() == 1.0
+    assert shown.with_all().normalized.visible.max() == 1.0

@@ -160,7 +160,9 @@ CASES: dict[str, Case] = {
     "a region that is no mask": Case(data=film, given={"region": np.ones((2, 3, 4, 5))}, track=True,
         words="region: expected a mask (H, W) of bool or uint8, or a polygon (N, 2) with N ≥ 3, got shape (2, 3, 4, 5), dtype float64. Convert the array."),
     "a polygon of two corners": Case(data=film, given={"region": np.ones((2, 2))}, track=True,
-        words="region: expected a polygon of at least 3 corners with finite pixel coordinates up to 1,000,000, got 2 corners. Draw around the object to track."),
+        words="region: expected a polygon of at least 3 corners around an area, with finite pixel coordinates up to 1,000,000, got 2 corners. Draw around the object to track."),
+    "a polygon on a line": Case(data=film, given={"region": np.array([[0, 0], [10, 10], [20, 20]])}, track=True,
+        words="region: expected a polygon of at least 3 corners around an area, with finite pixel coordinates up to 1,000,000, got corners on one line. Draw around the object to track."),
     "a region that is no picture": Case(data=film, given={"region": __file__}, track=True,
         words="region: expected a PNG, JPEG, WebP, BMP or GIF picture, got test_words_of_refusals.py: …. Save the mask as PNG: white inside, black outside."),
 }  # fmt: skip

@@ -17,12 +17,12 @@ from pliant.worker.errors import Interrupted
 from pliant.worker.execution.pace import MachinePace
 from pliant.worker.execution.pipeline import Halt, silent, solve_and_write
 from pliant.worker.execution.progress import FILM_SHARES, Reporter
-from pliant.worker.execution.solver_settings import solver_settings
 from pliant.worker.films import frame_strip
 from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.sources import FilmSource
 from pliant.worker.films.tracker import OnWarnings, track_film
+from pliant.worker.formats.solver_settings import solver_settings
 from pliant.worker.jobs.finished import Finished
 
 FILES = {

@@ -16,8 +16,8 @@ from pliant.worker.artifacts import build_report, kinds_for, write_artifacts
 from pliant.worker.artifacts.result import file_warnings
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.progress import Reporter
-from pliant.worker.execution.solver_settings import solver_settings
 from pliant.worker.formats import Inputs
+from pliant.worker.formats.solver_settings import solver_settings
 from pliant.worker.jobs.finished import Finished
 
 EXPORT_SECONDS = 1.5e-7

@@ -197,13 +197,18 @@ def film_options(options: Options, facts: FilmFacts) -> Options:
     Raises
     ------
     InvalidInput
-        The options give another image size.
+        The options give another image size, or require points to be visible in more frames than there are.
     """
     size = f"{facts.width}x{facts.height}"
     if options.image_size not in (None, size):
         raise InvalidInput(
             "invalid_option", field="options.image_size", expected=f"{size}, the size of the film, or none", got=str(options.image_size),
             hint="Leave it out: the film states its size.",
+        )  # fmt: skip
+    if 0 < facts.frames < options.min_seen:
+        raise InvalidInput(
+            "nothing_visible", field="options.min_seen", expected=f"at most {facts.frames}, the number of frames",
+            got=str(options.min_seen), hint="Set min_seen lower.",
         )  # fmt: skip
     known: dict[str, Any] = {"image_size": size}
     if "fps" not in options.model_fields_set:

@@ -22,9 +22,9 @@ from typing import IO, Any
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
-from pliant.worker.formats.canonical import save_inputs
+from pliant.worker.formats.canonical import load_inputs, save_inputs
 from pliant.worker.formats.errors import AmbiguousInput, too_large
-from pliant.worker.formats.read import read_inputs
+from pliant.worker.formats.read import check_options, read_inputs
 from pliant.worker.formats.reading.arrays import NPY_MAGIC, UNREADABLE_ZIP, check_directory, read_header
 from pliant.worker.formats.reading.parsers import HDF5
 from pliant.worker.formats.records import Limits
@@ -47,6 +47,9 @@ WITHOUT_BOUND = 1 << 62
 
 MEMBERS = 256
 """Maximum number of members of a zip file."""
+
+STORED = "stored"
+"""Part of a request that names inputs in canonical form."""
 
 MODULE = "pliant.worker.formats.isolated_reader"
 
@@ -76,7 +79,26 @@ def store_inputs(
         except InvalidInput as error:
             if error.code != "too_large":
                 raise
-    return _in_process(parts, options, limits, target)
+    return Interpretation.model_validate_json(_in_process(parts, options, limits, target))
+
+
+def check_stored(path: Path, options: Options, limits: Limits) -> None:
+    """Check that options agree with inputs in canonical form, as `store_inputs` checks them.
+
+    Raises
+    ------
+    InvalidInput
+        They contradict each other; too_large when reading needs more memory or time than the limits allow.
+    """
+    if path.stat().st_size <= LARGE:
+        _check_here(path, options)
+    else:
+        _in_process({STORED: path}, options, limits, None)
+
+
+def _check_here(path: Path, options: Options) -> None:
+    inputs = load_inputs(path)
+    check_options(inputs.tracks, inputs.mesh, inputs.cameras, options, y_axis=inputs.interpretation.y_axis)
 
 
 def _here(parts: dict[str, Any], options: Options, limits: Limits, target: Path | None) -> Interpretation:
@@ -125,7 +147,7 @@ def _numbers(file: IO[bytes], size: int, field: str) -> int:
     return max(size, math.prod(header.shape) * NUMBER)
 
 
-def _in_process(parts: dict[str, Any], options: Options, limits: Limits, target: Path | None) -> Interpretation:
+def _in_process(parts: dict[str, Any], options: Options, limits: Limits, target: Path | None) -> bytes:
     request = {
         "parts": {name: {"path": str(part)} if isinstance(part, Path) else part for name, part in parts.items()},
         "options": options.model_dump(mode="json"), "limits": asdict(limits),
@@ -134,7 +156,7 @@ def _in_process(parts: dict[str, Any], options: Options, limits: Limits, target:
     with tempfile.TemporaryDirectory(prefix="pliant-read-") as scratch:  # also removes what a killed process leaves
         ended = run_contained(MODULE, request, seconds=limits.read_seconds, environment={"TMPDIR": scratch})
     if ended.code == DONE:
-        return Interpretation.model_validate_json(ended.answer)
+        return ended.answer
     if ended.overdue:
         raise too_large("tracks", expected=f"inputs that are read within {limits.read_seconds:g} s", got="more")
     if ended.code in (-signal.SIGKILL, -signal.SIGXCPU):
@@ -162,8 +184,12 @@ def _answer(request: dict[str, Any]) -> str:
     limit_process({resource.RLIMIT_AS: limits.read_memory})
     parts = {name: Path(part["path"]) if isinstance(part, dict) else part for name, part in request["parts"].items()}
     target = None if request["target"] is None else Path(request["target"])
+    options = Options.model_validate(request["options"])
     try:
-        return _here(parts, Options.model_validate(request["options"]), limits, target).model_dump_json()
+        if STORED in parts:
+            _check_here(parts[STORED], options)
+            return ""
+        return _here(parts, options, limits, target).model_dump_json()
     except MemoryError as error:
         raise _too_much_memory(limits) from error
 

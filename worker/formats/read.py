@@ -10,19 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
-from pliant.solver import InvalidInput, Mesh, Tracks
+from pliant.solver import InvalidInput, KnownCamera, Mesh, Tracks
+from pliant.solver.agreement import check_agreement, check_principal_point, check_seen
+from pliant.solver.tracks.normalization import normalize
 from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.errors import MAX_NAMES, too_large
 from pliant.worker.formats.ground_truth import read_rotations, read_truth
 from pliant.worker.formats.meshes.surface import Surface, check_order, read_surface, whole_grid
 from pliant.worker.formats.meshes.triangulation import triangulate
 from pliant.worker.formats.reading.containers import read_arrays, shapes_in
-from pliant.worker.formats.records import MAX_COORDINATE, Arrays, GroundTruth, Inputs, Limits, Selection
+from pliant.worker.formats.records import MAX_COORDINATE, GroundTruth, Inputs, Limits, Selection
+from pliant.worker.formats.solver_settings import solver_settings
 from pliant.worker.formats.tracks.decimation import thin
 from pliant.worker.formats.tracks.film_tracks import FilmTracks, read_film_tracks, tracks_options
 from pliant.worker.formats.tracks.interpretation import Understood, understand
 from pliant.worker.formats.tracks.selection import chosen_frames, hide_sparsely_observed
-from pliant.worker.formats.tracks.tracker_formats import KNOWN, OWN
+from pliant.worker.formats.tracks.tracker_formats import KNOWN, OWN, TRACKS, TRUE_ROTATIONS
 from pliant.worker.formats.unused_options import notes_on_options
 
 LISTED = 1000
@@ -47,7 +50,7 @@ def read_inputs(
     Raises
     ------
     InvalidInput
-        With a stable code, the field, expected and actual value, and a hint.
+        With a stable code, the field, expected and actual value, and a hint; also where the options do not agree with the files.
     AmbiguousInput
         Several interpretations fit; the error lists them.
     """
@@ -73,12 +76,14 @@ def read_inputs(
         num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(),
         notes=[
             *notes_on_options(options, film=False), *understood.notes,
-            *unused_arrays(tracks, understood.arrays, own=film is not None, has_mesh=mesh is not None),
+            *unused_arrays(tracks, understood, has_mesh=mesh is not None, has_truth=truth is not None),
             *chosen.notes, *truth_notes,
         ],
         **({} if film is None else _stated(film, chosen.selection)),
     )  # fmt: skip
     known = tracks_options(options, interpretation)
+    check_seen(checked.visible)
+    check_options(checked, chosen.mesh, cameras, known, y_axis=understood.y_axis)
     estimate = estimated(checked.num_frames, checked.num_points, known, has_rotations=cameras is not None)
     interpretation = interpretation.model_copy(update={"estimate": estimate})
     texture = None if film is None or film.texture is None else film.texture.at_points(chosen.selection.points)
@@ -100,18 +105,46 @@ def read_inputs(
     )
 
 
-def unused_arrays(path: Path, used: Arrays, *, own: bool, has_mesh: bool) -> list[str]:
-    """Return a note that lists the arrays of an npz that the reader of tracks does not know.
+def check_options(
+    tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None, options: Options, *, y_axis: str
+) -> None:
+    """Check that options agree with tracks, mesh and cameras, and with each other.
 
-    `own` if `pliant track` wrote the file; `has_mesh` if the job has a mesh of its own.
+    Raises
+    ------
+    InvalidInput
+        What the solver would refuse, too.
     """
-    unknown = [(name, shape) for name, shape in shapes_in(path, {}).items() if name not in used and not own]
+    settings = solver_settings(options, y_up=y_axis == "up")
+    check_agreement(tracks, mesh, cameras, settings)
+    if settings.principal_point is not None:
+        normalized = normalize(tracks)
+        check_principal_point(normalized.centroid, normalized.unit, np.array(settings.principal_point))
+
+
+def unused_arrays(path: Path, understood: Understood, *, has_mesh: bool, has_truth: bool) -> list[str]:
+    """Return a note that lists the arrays of an npz that are not used; none if `pliant track` wrote the file.
+
+    `has_mesh` if the job has a mesh of its own, `has_truth` if it has true shapes, which true rotations belong to.
+    """
+    if understood.format == OWN:
+        return []
+    used = {name for name in understood.arrays if name == understood.name or name not in TRACKS}
+    if not has_truth:
+        used -= set(TRUE_ROTATIONS)
+    every: dict[str, tuple[int, ...] | None] = {name: array.shape for name, array in understood.arrays.items()}
+    unknown = [(name, shape) for name, shape in (every | shapes_in(path, {})).items() if name not in used]
     if not unknown:
         return []
     listed = ", ".join(f"{name} {shape}" if shape is not None else name for name, shape in unknown[:MAX_NAMES])
     more = f" and {len(unknown) - MAX_NAMES} more" if len(unknown) > MAX_NAMES else ""
     mesh = not has_mesh and any(name in ("faces", "grid") for name, _ in unknown)
-    return [f"Not used: {listed}{more}." + (" Send a mesh as the part mesh." if mesh else "")]
+    cameras = any(name in TRUE_ROTATIONS for name, _ in unknown)
+    return [
+        f"Not used: {listed}{more}."
+        + (" Send a mesh as the part mesh." if mesh else "")
+        + (" Send given cameras as the part rotations." if cameras else "")
+    ]
 
 
 def _stated(film: FilmTracks, selection: Selection) -> dict[str, Any]:

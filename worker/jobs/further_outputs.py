@@ -6,6 +6,7 @@ import hashlib
 from dataclasses import replace
 
 from pliant.schemas.job import Job, Status
+from pliant.schemas.options import Options
 from pliant.schemas.outputs import OutputRequest
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import NotAllowedNow
@@ -44,9 +45,13 @@ def make_outputs(
     UnknownJob
         There is no such job, or it was deleted meanwhile.
     """
+    wish = hashlib.sha256(f"outputs of {id}: {request.model_dump_json()}".encode()).hexdigest()
+    if idempotency_key is not None:  # a repeated request returns its job, even if the original has been deleted
+        known = jobs.known(Submission(options=Options(), idempotency_key=idempotency_key, fingerprint=wish))
+        if known is not None:
+            return known, False
     stored = jobs.stored(id)
     job = stored.job
-    wish = hashlib.sha256(f"outputs of {id}: {request.model_dump_json()}".encode()).hexdigest()
     submission = Submission(
         options=request.applied_to(job.options), name=job.name, idempotency_key=idempotency_key or f"outputs {wish}",
         fingerprint=wish,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 
 from pliant.schemas.job import Job, Status
+from pliant.schemas.options import Options
 from pliant.worker.errors import NotAllowedNow
 from pliant.worker.ids import new_job_id
 from pliant.worker.jobs import lifecycle
@@ -31,15 +32,16 @@ def retry(jobs: Jobs, id: str, *, idempotency_key: str | None = None) -> Job:
     UnknownJob
         There is no such job, or it was deleted in the meantime.
     """
+    # Before the job is read: a repeated request returns the new job, even if this one has been deleted.
+    fingerprint = hashlib.sha256(f"retry of {id}".encode()).hexdigest()
+    known = jobs.known(Submission(options=Options(), idempotency_key=idempotency_key, fingerprint=fingerprint))
+    if known is not None:
+        return known
     stored = jobs.stored(id)
     job = stored.job
     submission = Submission(
-        options=job.options, name=job.name, idempotency_key=idempotency_key, webhook=stored.webhook,
-        fingerprint=hashlib.sha256(f"retry of {id}".encode()).hexdigest(),
+        options=job.options, name=job.name, idempotency_key=idempotency_key, webhook=stored.webhook, fingerprint=fingerprint,
     )  # fmt: skip
-    known = jobs.known(submission)
-    if known is not None:
-        return known
     if job.status not in (Status.FAILED, Status.CANCELLED):
         hint = (
             "It already has a result." if job.status is Status.SUCCEEDED else "Wait until it ends, or cancel it first."

@@ -148,11 +148,14 @@ class Jobs:
         check_page(cursor, limit)
         wanted = tuple(Status) if statuses is None else tuple(statuses)
         found, following = self.records.page(cursor=cursor, limit=limit, statuses=wanted, owner=self.owner)
-        places: dict[str, int] = {}
+        places: dict[str, int | None] = {}
         if any(each.job.status is Status.QUEUED for each in found):
             places = {attempt_id: place for place, attempt_id in enumerate(self.queue.waiting())}
+            places |= dict.fromkeys(self.queue.held())
         jobs = [
-            each.job.model_copy(update={"place_in_queue": places.get(each.attempt_id)})
+            each.job.model_copy(
+                update={"place_in_queue": places.get(each.attempt_id, 0)}
+            )  # 0: a worker has just taken it
             if each.job.status is Status.QUEUED
             else each.job
             for each in found
@@ -358,6 +361,8 @@ class Jobs:
             return stored.job
         try:
             place = self.queue.place(stored.attempt_id)
+            if place is None and stored.attempt_id not in self.queue.held():
+                place = 0  # a worker has just taken it
         except StoreUnavailable:
             return stored.job
         return stored.job.model_copy(update={"place_in_queue": place})

@@ -6,6 +6,7 @@ import httpx
 import numpy as np
 import pytest
 from pliant.schemas.job import Job
+from pliant.worker.formats import isolated_reader
 from pliant.worker.formats.cost import estimated
 from serving import Running, finish, form, npz, submit
 
@@ -80,6 +81,34 @@ def test_a_rerun_with_contradictory_options_is_rejected(running: Running, http: 
     parts = {"inputs_of": (None, first.id), "options": (None, '{"focal": 900, "field_of_view": 60}')}
     answer = http.post("/v1/jobs", files=parts)
     assert (answer.status_code, answer.json()["field"]) == (422, "options.field_of_view")
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "field"),
+    [
+        ('{"image_size": "3x2"}', "outside_picture", "image_size"),
+        ('{"principal_point": "1000000,0"}', "principal_point_far", "principal_point"),
+        ('{"laplacian": "grid8"}', "invalid_option", "laplacian"),
+    ],
+)
+@pytest.mark.parametrize("large", [False, True])
+def test_a_rerun_with_options_that_contradict_the_inputs_is_refused(
+    running: Running,
+    http: httpx.Client,
+    monkeypatch: pytest.MonkeyPatch,
+    options: str,
+    code: str,
+    field: str,
+    large: bool,
+) -> None:
+    first = submit(http)
+    finish(running, first.id, b"x")
+    if large:  # in a process of its own
+        monkeypatch.setattr(isolated_reader, "LARGE", 0)
+    answer = http.post("/v1/jobs", files={"inputs_of": (None, first.id), "options": (None, options)})
+    assert (answer.status_code, answer.json()["code"], answer.json()["field"]) == (422, code, f"options.{field}")
+    good = http.post("/v1/jobs", files={"inputs_of": (None, first.id), "options": (None, '{"loss": "huber"}')})
+    assert good.status_code == 202
 
 
 @pytest.mark.parametrize("path", ["/v1/jobs", "/v1/inspect"])

@@ -339,7 +339,7 @@ def test_an_image_size_that_excludes_the_tracks_is_rejected() -> None:
 def test_a_distant_principal_point_is_rejected() -> None:
     tracks = pinhole(SEEN, FOCAL)
     with pytest.raises(InvalidInput) as refused:
-        given_lens(tracks, normalize(tracks), Settings(principal_point=(1e7, 0.0)))
+        given_lens(normalize(tracks), Settings(principal_point=(1e7, 0.0)))
     assert refused.value.code == "principal_point_far"
 
 
@@ -360,7 +360,7 @@ def test_shapes_centred_on_more_points_keep_their_image() -> None:
     """If depths were relative to the mean of some points, scales and translations change so that pixels stay."""
     tracks = pinhole(SEEN, FOCAL)
     normalized = normalize(tracks)
-    view = given_lens(tracks, normalized, Settings(focal=FOCAL, image_size=PICTURE))
+    view = given_lens(normalized, Settings(focal=FOCAL, image_size=PICTURE))
     assert view is not None
     kept = np.arange(20)
     middle = SEEN[:, kept].mean(axis=1)

@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pliant.solver import InvalidSettings, KnownCamera, Settings, Tracks, gallery, solve
+from pliant.solver.agreement import check_agreement
 from pliant.solver.evaluation.metrics import e3d_frame
+from pliant.solver.limits import MAX_UNORDERED_FRAMES
 from pliant.solver.model import full_mode_covariance
 from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.marginal_likelihood import Motion, Scene, energy, start
 from pliant.solver.model.so3 import exponential
 from pliant.solver.tracks.frame_order import (
-    MAX_UNORDERED_FRAMES,
     content_order,
     differences,
     resolved_order,
@@ -163,7 +164,7 @@ def test_unsupported_order_settings_are_rejected() -> None:
     assert refused.value.field == "options.order"
     many = Tracks.from_arrays(np.random.default_rng(3).normal(size=(MAX_UNORDERED_FRAMES + 1, 5, 2)))
     with pytest.raises(InvalidSettings, match="360") as refused:
-        resolved_order(many, Settings(order="any"))
+        check_agreement(many, None, None, Settings(order="any"))
     assert refused.value.field == "options.order"
     settings, why = resolved_order(many, Settings())
     assert settings.order == "film"

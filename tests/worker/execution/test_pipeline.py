@@ -18,8 +18,8 @@ from pliant.worker.artifacts.result import file_warnings
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.failures import problem_of
 from pliant.worker.execution.pipeline import reconstruct
-from pliant.worker.execution.solver_settings import solver_settings
 from pliant.worker.formats import Inputs
+from pliant.worker.formats.solver_settings import solver_settings
 from worker_house import make_inputs
 
 CHEAP = Options(prior="smooth", max_reweightings=1, refine_rotations=False, surface="free", camera="orthographic")

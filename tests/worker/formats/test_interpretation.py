@@ -71,8 +71,32 @@ def test_y_before_x_is_detected_by_the_image_size(tmp_path: Path) -> None:
     got = read(tmp_path, {"tracks": wide[..., ::-1]}, image_size="641x100")
     np.testing.assert_array_equal(got.tracks.points, wide)
     assert any("read as y, x: 100%" in note for note in got.interpretation.notes)
-    kept = read(tmp_path, {"tracks": wide[..., ::-1]}, image_size="641x100", coordinate_order="xy")
-    np.testing.assert_array_equal(kept.tracks.points, wide[..., ::-1])
+    kept = understand({"tracks": wide[..., ::-1]}, Options(image_size="641x100", coordinate_order="xy"))
+    np.testing.assert_array_equal(kept.points, wide[..., ::-1])
+
+
+@pytest.mark.parametrize(
+    ("code", "field", "options"),
+    [
+        ("outside_picture", "image_size", {"image_size": "3x2"}),
+        ("principal_point_far", "principal_point", {"principal_point": "1000000,0"}),
+        ("invalid_option", "laplacian", {"laplacian": "grid8"}),
+        ("invalid_option", "surface", {"surface": "isometric"}),
+        ("invalid_option", "focal", {"focal": 900, "camera": "orthographic"}),
+    ],
+)
+def test_options_that_contradict_the_files_are_refused(
+    tmp_path: Path, code: str, field: str, options: dict[str, object]
+) -> None:
+    np.savez(tmp_path / "tracks.npz", tracks=POINTS)
+    np.savez(tmp_path / "rotations.npz", rotations=np.broadcast_to(np.eye(3), (F, 3, 3)))
+    with pytest.raises(InvalidInput) as caught:
+        read_inputs(
+            tracks=tmp_path / "tracks.npz",
+            rotations=tmp_path / "rotations.npz",
+            options=Options.model_validate(options),
+        )
+    assert (caught.value.code, caught.value.field) == (code, f"options.{field}")
 
 
 def test_a_contradicted_layout_is_ambiguous(tmp_path: Path) -> None:
@@ -306,3 +330,35 @@ def test_empty_arrays_are_refused() -> None:
 def read_whole(array: np.ndarray) -> None:
     got = understand({"W" if array.ndim == 2 else "tracks": array}, Options())
     Tracks.from_arrays(got.points)
+
+
+def test_arrays_of_the_same_meaning_and_cameras_in_the_tracks_file_are_listed_as_not_used(tmp_path: Path) -> None:
+    turns = np.broadcast_to(np.eye(3), (F, 3, 3))
+    got = read(tmp_path, {"tracks": POINTS, "W": MATRIX, "rotations": turns})
+    assert [note for note in got.interpretation.notes if note.startswith("Not used")] == [
+        f"Not used: W {MATRIX.shape}, rotations ({F}, 3, 3). Send given cameras as the part rotations."
+    ]
+    with_truth = read(tmp_path, {"tracks": POINTS, "shapes": SHAPES, "rotations": turns})
+    assert not any(note.startswith("Not used") for note in with_truth.interpretation.notes)
+
+
+def test_points_that_are_hardly_seen_are_refused_before_queueing(tmp_path: Path) -> None:
+    seen = np.zeros((F, P), dtype=bool)
+    seen[:, :3] = True
+    seen[0] = True
+    with pytest.raises(InvalidInput, match="visible in two or more frames") as caught:
+        read(tmp_path, {"tracks": POINTS, "visibility": seen})
+    assert (caught.value.code, caught.value.field) == ("too_little_seen", "visibility")
+
+
+@pytest.mark.parametrize("every", [2, 10])
+def test_tracks_with_empty_frames_are_read(tmp_path: Path, every: int) -> None:
+    time = np.arange(60)[:, None]
+    across = np.random.default_rng(0).uniform(0, 100, (2, 1, 40))
+    points = np.stack([across[0] + 0.3 * time, across[1] + 5 * np.sin(0.1 * time)], axis=2)
+    points[np.arange(60) % every > 0] = np.nan
+    np.testing.assert_array_equal(read(tmp_path, {"tracks": points}, min_seen=1).tracks.visible[0], 1)
+    lines = [f"{f},{p},{x},{y}" for f in range(0, 60, every) for p, (x, y) in enumerate(points[f])]
+    (tmp_path / "tracks.csv").write_text("frame,point,x,y\n" + "\n".join(lines))
+    table = read_inputs(tracks=tmp_path / "tracks.csv", mesh="none", options=Options(min_seen=1))
+    assert table.tracks.points.shape == (60 - every + 1, 40, 2)

@@ -115,9 +115,16 @@ def test_a_grid_keeps_every_nth_row_and_column(folder: Path, how: dict[str, int]
 
 
 def test_a_stride_that_leaves_too_few_points_is_refused(folder: Path) -> None:
-    with pytest.raises(InvalidInput, match="leaves 4 points or more") as caught:
-        read(folder, f"{ROWS}x{COLUMNS}", stride=1000)
-    assert (caught.value.code, caught.value.field) == ("too_few_points", "options.stride")
+    for mesh in (f"{ROWS}x{COLUMNS}", "none"):
+        with pytest.raises(InvalidInput, match="leaves 4 points or more") as caught:
+            read(folder, mesh, stride=1000)
+        assert (caught.value.code, caught.value.field) == ("too_few_points", "options.stride")
+
+
+def test_a_maximum_that_leaves_too_few_points_of_a_grid_is_refused(folder: Path) -> None:
+    with pytest.raises(InvalidInput, match="larger max_points") as caught:
+        read(folder, f"1x{ROWS * COLUMNS}", max_points=4, stride=3 * ROWS * COLUMNS // 4)
+    assert (caught.value.code, caught.value.field) == ("too_few_points", "options.max_points")
 
 
 def test_a_grid_with_holes_keeps_its_holes(folder: Path) -> None:

@@ -11,8 +11,8 @@ import pytest
 from pliant.cli import app
 from pliant.schemas.options import Options
 from pliant.solver import Solution, solve
-from pliant.worker.execution.solver_settings import solver_settings
 from pliant.worker.formats import Inputs, read_inputs
+from pliant.worker.formats.solver_settings import solver_settings
 from track_files import COLUMNS, FORMATS, ROWS, Written
 from typer.testing import CliRunner
 
@@ -67,3 +67,10 @@ def test_the_documented_table_is_the_tested_one() -> None:
     assert [row for row in rows if row in {(made.title, made.layout) for made in FORMATS}] == [
         (made.title, made.layout) for made in FORMATS
     ]
+
+
+def test_confidence_beside_visibility_multiplies_it(tmp_path: Path) -> None:
+    rows = [f"{f},{p},{10 * p + f},{p * p + 2 * f},{int(p > 0)},{0.6 + 0.1 * p}" for f in range(4) for p in range(5)]
+    (tmp_path / "tracks.csv").write_text("frame,point,x,y,visible,confidence\n" + "\n".join(rows))
+    got = read_inputs(tracks=tmp_path / "tracks.csv", mesh="none", options=Options())
+    np.testing.assert_allclose(got.tracks.visible, np.tile([0, 0.7, 0.8, 0.9, 1.0], (4, 1)))

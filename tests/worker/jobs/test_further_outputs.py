@@ -175,3 +175,18 @@ def test_inconsistent_or_damaged_files_are_refused(jobs: Jobs, solved: Job, tmp_
     jobs.blobs.fetch(f"{stored.prefix}shapes.npz", tmp_path / "shapes.npz")
     with pytest.raises(InvalidInput, match="different sizes"):
         write_further(tmp_path / "other.npz", tmp_path / "shapes.npz", solved, tmp_path / "out")
+
+
+def test_repeated_requests_find_their_job_after_the_original_is_deleted(
+    jobs: Jobs, solved: Job, tmp_path: Path
+) -> None:
+    more, _ = make_outputs(jobs, solved.id, WANTED, idempotency_key="outputs once")
+    jobs.cancel(more.id)
+    again = retry(jobs, more.id, idempotency_key="retry once")
+    jobs.delete(solved.id)
+    jobs.delete(more.id)
+    assert retry(jobs, more.id, idempotency_key="retry once").id == again.id
+    with pytest.raises(Conflict):
+        make_outputs(jobs, more.id, WANTED, idempotency_key="retry once")
+    with pytest.raises(UnknownJob):
+        make_outputs(jobs, solved.id, WANTED)

@@ -135,3 +135,18 @@ def test_a_tokens_running_limit_overrides_the_default(
         assert [attempt_id.rpartition("-")[0] for attempt_id in world.jobs.queue.waiting()] == expected
         assert findings(world.jobs, pause=0) == []
         world.pass_seconds(10)
+
+
+def test_the_place_in_queue_is_zero_once_a_worker_has_taken_the_job_and_null_while_it_is_held_back(
+    tmp_path: Path, inputs_file: Path, interpretation: Interpretation
+) -> None:
+    world = World(tmp_path, max_running=1)
+    jobs = world.jobs.of("ada")
+    first, second = (
+        jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation) for _ in range(2)
+    )
+    assert (first.place_in_queue, second.place_in_queue) == (0, None)
+    world.jobs.queue.remove(world.jobs.queue.waiting()[0])
+    places = {job.id: job.place_in_queue for job in jobs.page().jobs}
+    assert places == {first.id: 0, second.id: None}
+    assert (jobs.get(first.id).place_in_queue, jobs.get(second.id).place_in_queue) == (0, None)

@@ -116,11 +116,13 @@ def _observations(columns: list[str], rows: list[list[float]], *, field: str, li
     tracks = np.full((count * len(names), 2), np.nan)
     tracks[places] = table[:, [index["x"], index["y"]]]
     found: Arrays = {"tracks": tracks.reshape(count, len(names), 2)}
-    seen = next((index[name] for name in CONFIDENCE if name in index), None)
-    if seen is not None:
-        visible = np.zeros(count * len(names))
-        visible[places] = table[:, seen]
-        found["visibility"] = visible.reshape(count, len(names))
+    given = [name for name in CONFIDENCE if name in index]
+    for array, name in zip(
+        ("visibility", "confidence"), given, strict=False
+    ):  # of two, the second multiplies the first
+        values = np.zeros(count * len(names))
+        values[places] = table[:, index[name]]
+        found[array] = values.reshape(count, len(names))
     return found
 
 

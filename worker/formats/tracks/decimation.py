@@ -42,17 +42,32 @@ def thin(
     Raises
     ------
     InvalidInput
-        Code too_few_points, if a grid's stride leaves fewer than four.
+        Code too_few_points, if fewer than four are left.
     """
     count = points.shape[1]
     limit = count if options.max_points is None else options.max_points
     if options.stride == 1 and limit >= count:
         return np.arange(count), mesh, []
+    kept, coarse, notes = _thinned(points, visible, mesh, options.stride, limit)
+    if len(kept) < MIN_POINTS <= count:
+        by_stride = options.max_points is None
+        raise InvalidInput(
+            "too_few_points", field="options.stride" if by_stride else "options.max_points",
+            expected=f"a value that leaves {MIN_POINTS} points or more", got=f"{len(kept)} of {count}",
+            hint="Use a smaller stride." if by_stride else "Use a larger max_points, or a smaller stride.",
+        )  # fmt: skip
+    return kept, coarse, notes
+
+
+def _thinned(
+    points: NDArray[np.generic], visible: NDArray[np.float64] | None, mesh: Mesh | None, stride: int, limit: int
+) -> tuple[Indices, Mesh | None, list[str]]:
+    count = points.shape[1]
     if mesh is not None and mesh.grid is not None:
-        return _thin_grid(mesh.grid, options.stride, limit)
+        return _thin_grid(mesh.grid, stride, limit)
     if mesh is None or len(mesh.faces) == 0:
-        kept = np.arange(0, count, options.stride)
-        how = f"one in {options.stride}" if options.stride > 1 else "all"
+        kept = np.arange(0, count, stride)
+        how = f"one in {stride}" if stride > 1 else "all"
         if len(kept) > limit:
             kept, how = (
                 kept[spread(*_places(points[:, kept], visible if visible is None else visible[:, kept]), limit)],
@@ -60,7 +75,7 @@ def thin(
             )
         empty = None if mesh is None else Mesh.from_faces(np.zeros((0, 3), np.int32), len(kept))
         return kept, empty, [f"{len(kept)} of {count} points are used: {how}."]
-    return _thin_mesh(points, visible, mesh, min(limit, math.ceil(count / options.stride)))
+    return _thin_mesh(points, visible, mesh, min(limit, math.ceil(count / stride)))
 
 
 def _thin_grid(grid: NDArray[np.int32], stride: int, limit: int) -> tuple[Indices, Mesh, list[str]]:
@@ -68,11 +83,6 @@ def _thin_grid(grid: NDArray[np.int32], stride: int, limit: int) -> tuple[Indice
         stride += 1
     coarse = _without_loose_cells(grid[::stride, ::stride])
     kept = np.sort(coarse[coarse >= 0])
-    if len(kept) < MIN_POINTS:
-        raise InvalidInput(
-            "too_few_points", field="options.stride", expected=f"a stride that leaves {MIN_POINTS} points or more",
-            got=f"{len(kept)} at stride {stride}", hint="Use a smaller stride, or a larger max_points.",
-        )  # fmt: skip
     numbers = np.full(int(grid.max()) + 1, -1)
     numbers[kept] = np.arange(len(kept))
     renumbered = np.where(coarse >= 0, numbers[np.maximum(coarse, 0)], -1)

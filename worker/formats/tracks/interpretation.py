@@ -53,6 +53,9 @@ class Understood:
     arrays: Arrays
     """All arrays of the file, which may include ground truth."""
 
+    name: str
+    """Name of the array that holds the tracks."""
+
     point_names: tuple[str, ...] | None = None
     """Names of the P points, where the file has them."""
 
@@ -90,7 +93,7 @@ def understand(arrays: Arrays, options: Options, *, file: Path | None = None) ->
         whose.append(note(names))
     return Understood(
         points=placed.points, visible=visible, format=dialect.name, layout=layout, coordinates=placed.coordinates,
-        y_axis=y_axis, grid=flat.grid, notes=[*whose, *notes, *placed.notes, *how, *why], arrays=named,
+        y_axis=y_axis, grid=flat.grid, notes=[*whose, *notes, *placed.notes, *how, *why], arrays=named, name=name,
         point_names=names,
     )  # fmt: skip
 
@@ -107,7 +110,7 @@ def _of_our_tracker(named: Arrays, name: str, options: Options) -> Understood:
     names = _names(named, points.shape[1], ordered=True)
     return Understood(
         points=points, visible=None, format=OWN, layout="tracks (F, P, 2)", coordinates="pixels", y_axis=y_axis, grid=None,
-        notes=["Recognised as the output of pliant track.", *([] if names is None else [note(names)])], arrays=named,
+        notes=["Recognised as the output of pliant track.", *([] if names is None else [note(names)])], arrays=named, name=name,
         point_names=names,
     )  # fmt: skip
 

@@ -96,7 +96,7 @@ def roughness(points: NDArray[np.generic]) -> float:
         return float("inf")
     with np.errstate(invalid="ignore", divide="ignore"):
         spread = np.nanstd(sample, axis=(0, 1)).mean()
-        step = np.nanmean(np.abs(np.diff(sample, axis=0))) if np.isfinite(np.diff(sample, axis=0)).any() else np.inf
+        step = _step(sample)
         centred = sample - np.nanmean(sample, axis=(0, 1))
         x, y = centred[..., 0], centred[..., 1]
         usable = np.isfinite(x).sum(axis=1) >= MIN_POINTS
@@ -108,6 +108,16 @@ def roughness(points: NDArray[np.generic]) -> float:
     if len(alike) and np.isfinite(alike).any() and np.nanmedian(np.abs(alike)) > ALIKE:
         return float("inf")
     return float(step / spread) if spread > 0 else float("inf")
+
+
+def _step(sample: NDArray[np.float64]) -> float:
+    """Return the mean step of the coordinates `(F, P, 2)` between neighbouring frames, or between those that show a point if none do."""
+    steps = np.diff(sample, axis=0)
+    if not np.isfinite(steps).any():
+        steps = np.concatenate(
+            [np.diff(path[np.isfinite(path).all(axis=1)], axis=0) for path in sample.transpose(1, 0, 2)]
+        )
+    return float(np.nanmean(np.abs(steps))) if np.isfinite(steps).any() else float("inf")
 
 
 def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: Options) -> tuple[Reading, list[str]]:
@@ -183,4 +193,5 @@ def _evidence(best: Reading, other: Reading, costs: dict[str, float]) -> str:
 
 
 def _number(cost: float) -> str:
-    return f"{cost:.3g} of the coordinates' spread" if np.isfinite(cost) else "x and y would be the same coordinate"
+    same = "x and y would be the same coordinate, or no point is seen twice"
+    return f"{cost:.3g} of the coordinates' spread" if np.isfinite(cost) else same

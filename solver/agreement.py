@@ -1,0 +1,148 @@
+"""Whether tracks, mesh, cameras and settings agree: every contradiction that can be seen without solving.
+
+Nothing here needs SciPy, so a reader can refuse a job before it is queued.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pliant.solver.errors import InvalidInput, InvalidSettings
+from pliant.solver.limits import MAX_UNORDERED_FRAMES, frame_chunks
+from pliant.solver.mesh import Mesh
+from pliant.solver.records import MIN_POINTS, Floats, KnownCamera, Tracks
+from pliant.solver.settings import Settings
+
+MAX_CENTRE_RADII = 100.0
+"""Maximum distance, along x and along y, of a principal point from the frames' centroids, RMS radii: a view of 1° or more."""
+
+
+def check_agreement(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None, settings: Settings) -> None:
+    """Check that mesh and given cameras match the tracks, and the settings all of them.
+
+    `check_principal_point` is separate, because it needs normalized tracks.
+
+    Raises
+    ------
+    InvalidInput
+        Number of vertices (code `mesh_mismatch`) or of cameras (`camera_mismatch`); cameras with a focal length while the settings have
+        another one or an orthographic model (`camera_mismatch`); half or more of the observations outside `image_size`
+        (`outside_picture`).
+    InvalidSettings
+        `laplacian="grid8"` with a mesh that is not a grid, `surface="isometric"` with given cameras, `camera="orthographic"` with given
+        scales that are not 1, or `order="any"` with more than `MAX_UNORDERED_FRAMES` frames.
+    """
+    if mesh is not None:
+        _check_mesh(tracks, mesh, settings)
+    if cameras is not None:
+        _check_cameras(tracks, cameras, settings)
+    if settings.order == "any" and tracks.num_frames > MAX_UNORDERED_FRAMES:
+        raise InvalidSettings(
+            "invalid_option", field="options.order", expected=f"film or auto with more than {MAX_UNORDERED_FRAMES} frames",
+            got=f"'any' with {tracks.num_frames}", hint="Select some of the photographs with the option frames.",
+        )  # fmt: skip
+    if settings.image_size is not None:
+        _check_picture(tracks, settings.image_size)
+
+
+def check_seen(visible: Floats) -> None:
+    """Check that enough points are visible in two or more frames.
+
+    Raises
+    ------
+    InvalidInput
+        Fewer than `MIN_POINTS`.
+    """
+    again = seen_again(visible)
+    if again < MIN_POINTS:
+        raise InvalidInput(
+            "too_little_seen", field="visibility", expected=f"at least {MIN_POINTS} points that are visible in two or more frames",
+            got=f"{again}", hint="Check that the visibility is not inverted, and that a point has the same index in every frame.",
+        )  # fmt: skip
+
+
+def seen_again(visible: Floats) -> int:
+    """Return the number of points that are visible in two or more frames."""
+    return int(((visible > 0).sum(axis=0) >= 2).sum())
+
+
+def check_principal_point(centroids: Floats, unit: float, point: Floats) -> None:
+    """Check that a principal point is near the tracks.
+
+    Parameters
+    ----------
+    centroids : array, shape (F, 2)
+        Centroid of every frame.
+    unit : float
+        RMS radius of the tracks.
+    point : array, shape (2,)
+        Principal point, in the unit of the centroids.
+
+    Raises
+    ------
+    InvalidInput
+        More than `MAX_CENTRE_RADII` from the centroid of a frame.
+    """
+    if not np.abs(centroids - point).max() < MAX_CENTRE_RADII * unit:
+        raise InvalidInput(
+            "principal_point_far", field="options.principal_point",
+            expected=f"a point within {MAX_CENTRE_RADII:.0f} RMS radii of the tracks",
+            got=f"({point[0]:.5g}, {point[1]:.5g})", hint="Give x, y in the unit and axes of the tracks.",
+        )  # fmt: skip
+
+
+def _check_mesh(tracks: Tracks, mesh: Mesh, settings: Settings) -> None:
+    if mesh.num_points != tracks.num_points:
+        raise InvalidInput(
+            "mesh_mismatch", field="mesh", expected=f"{tracks.num_points} vertices, one for each point of the tracks",
+            got=f"{mesh.num_points}", hint="Vertex i of the mesh must be point i of the tracks.",
+        )  # fmt: skip
+    if settings.laplacian == "grid8" and mesh.grid is None and len(mesh.faces) > 0:
+        raise InvalidSettings(
+            "invalid_option", field="options.laplacian", expected="a mesh that is a pixel grid", got="faces only",
+            hint="Use laplacian auto, uniform or cotangent, or give the points as a grid.",
+        )  # fmt: skip
+
+
+def _check_cameras(tracks: Tracks, cameras: KnownCamera, settings: Settings) -> None:
+    if len(cameras.rotations) != tracks.num_frames:
+        raise InvalidInput(
+            "camera_mismatch", field="rotations", expected=f"{tracks.num_frames} rotations, one for each frame of the tracks",
+            got=f"{len(cameras.rotations)}", hint="Pass one camera per frame, in the order of the frames.",
+        )  # fmt: skip
+    if settings.surface == "isometric":
+        raise InvalidSettings(
+            "invalid_option", field="options.surface", expected="auto or free where rotations are given", got="'isometric'",
+            hint="Omit the rotations: an isometric surface determines its own cameras.",
+        )  # fmt: skip
+    if settings.camera == "orthographic" and cameras.scales is not None and not np.allclose(cameras.scales, 1):
+        raise InvalidSettings(
+            "invalid_option", field="options.camera", expected="auto, scaled_orthographic or perspective beside given scales",
+            got="'orthographic'", hint="Orthographic cameras have scale 1. Choose another model, or leave the scales out.",
+        )  # fmt: skip
+    given = settings.focal_length
+    orthographic = settings.camera in ("orthographic", "scaled_orthographic")
+    if cameras.focal is not None and (orthographic or given not in (None, cameras.focal)):
+        raise InvalidInput(
+            "camera_mismatch", field="cameras.focal", expected=f"no focal length with camera {settings.camera} and focal {given}",
+            got=f"{cameras.focal}", hint="Give the focal length once, with camera perspective or auto.",
+        )  # fmt: skip
+
+
+def _check_picture(tracks: Tracks, size: tuple[float, float]) -> None:
+    """Check that most visible positions lie inside the picture."""
+    within = total = 0
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for chunk in frame_chunks(tracks.num_frames, tracks.num_points):
+        seen = tracks.points[chunk][tracks.visible[chunk] > 0]
+        within += int(np.count_nonzero(((seen >= -0.5) & (seen <= np.array(size) - 0.5)).all(axis=1)))
+        total += len(seen)
+        low = np.minimum(low, seen.min(axis=0, initial=np.inf))
+        high = np.maximum(high, seen.max(axis=0, initial=-np.inf))
+    if 2 * within > total:
+        return
+    raise InvalidInput(
+        "outside_picture", field="options.image_size",
+        expected=f"most positions within 0 … {size[0] - 1:g} and 0 … {size[1] - 1:g}",
+        got=f"{within} of {total}; x from {low[0]:.5g} to {high[0]:.5g}, y from {low[1]:.5g} to {high[1]:.5g}",
+        hint="Correct image_size, or leave it out where tracks are not in pixels from the picture's corner.",
+    )  # fmt: skip
