@@ -31,7 +31,7 @@ from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR
 from pliant.solver.records import Floats
-from pliant.solver.tracks.completion import Filling, spans
+from pliant.solver.tracks.completion import Filling, often_visible, spans
 from pliant.solver.tracks.normalization import Normalized
 from scipy import linalg
 
@@ -108,7 +108,11 @@ class Perspective:
     """How hidden entries are completed; None if there are none."""
 
     sample: Floats = field(default_factory=lambda: np.zeros((0, 0, 2)))
-    """Sampled complete tracks, uncorrected, relative to the principal point, shape `(F, S, 2)`, normalized units."""
+    """Complete tracks, uncorrected, of the sampled points that are often visible, relative to the principal point, shape `(F, S', 2)`,
+    normalized units."""
+
+    whole: Floats = field(default_factory=lambda: np.zeros((0, 0, 2)))
+    """The same of all sampled points, shape `(F, S, 2)`."""
 
     depth: Floats | DepthMap = field(default_factory=lambda: np.zeros((0, 0)))
     """D of the latest cameras and covariance, shape `(F, 2F)`."""
@@ -226,7 +230,7 @@ def corrected_moments(view: Perspective, normalized: Normalized) -> tuple[Floats
     frames = len(normalized.points)
     gram, total, used = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2)), 0
     origin = mean_depth(view)
-    for _, points in spans(normalized, view.filling):
+    for _, points in spans(normalized, view.filling, often_visible(normalized.visible)):
         changed = _corrected_by(view, points + view.offsets[:, None], origin) - view.offsets[:, None]
         stacked = columns(changed)
         gram += stacked @ stacked.T
@@ -234,7 +238,7 @@ def corrected_moments(view: Perspective, normalized: Normalized) -> tuple[Floats
         used += points.shape[1]
     mean = total / used
     flat = mean.reshape(-1)
-    return gram / used - np.outer(flat, flat), mean, centred(_corrected_by(view, view.sample))
+    return gram / used - np.outer(flat, flat), mean, centred(_corrected_by(view, view.whole, origin))
 
 
 def _corrected_by(view: Perspective, views: Floats, origin: Floats | None = None) -> Floats:

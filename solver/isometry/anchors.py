@@ -194,8 +194,11 @@ def _centred(points: Floats, seen: NDArray[np.bool_]) -> Floats:
 
 def _apart(points: Floats, seen: NDArray[np.bool_], some: Indices, *, quantile: float = 0.5) -> Floats:
     """Return a quantile over frames of the image distances from the points `some` to all, `(S, N)`; infinite without a common frame."""
-    distance = np.linalg.norm(points[:, some, None] - points[:, None], axis=3)
-    return _over_frames(np.where(seen[:, some, None] & seen[:, None], distance, np.nan), quantile)
+    found = np.zeros((len(some), points.shape[1]))
+    for row, one in zip(found, some, strict=True):  # all at once would take a quarter of a gigabyte
+        distance = np.linalg.norm(points[:, one, None] - points, axis=2)
+        row[:] = _over_frames(np.where(seen[:, one, None] & seen, distance, np.nan), quantile)
+    return found
 
 
 def _over_frames(values: Floats, quantile: float) -> Floats:

@@ -19,6 +19,7 @@ from pliant.solver.refinement.bas_relief import LOG_DEPTH_STD
 from pliant.solver.refinement.depth_alternation import alternated, factorized_again
 from pliant.solver.refinement.focal_length import search
 from pliant.solver.refinement.learned import Learned, stretched
+from pliant.solver.tracks.completion import often_visible
 from pliant.solver.tracks.normalization import Normalized
 
 RESTARTS = 3
@@ -56,10 +57,9 @@ def settled(
         Called between fits; once it returns True, the best so far is returned.
     """
     assert estimate.perspective is not None
-    shift = estimate.perspective.offsets + estimate.translations
-    view = replace(
-        estimate.perspective, filling=estimate.filling, sample=estimate.sample + shift[:, None]
-    )  # fmt: skip
+    whole = estimate.sample + (estimate.perspective.offsets + estimate.translations)[:, None]
+    often = often_visible(normalized.visible)[estimate.sampled]
+    view = replace(estimate.perspective, filling=estimate.filling, sample=whole[:, often], whole=whole)
     rotations, scales = np.asarray(estimate.rotations), np.asarray(estimate.scales)
     view, found = search(
         view.sample[used], rotations[used], scales[used], view,

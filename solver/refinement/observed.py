@@ -19,6 +19,7 @@ from pliant.solver.model.expectation_maximisation import learned
 from pliant.solver.model.observation_model import ImageDensity, inlier_probabilities
 from pliant.solver.records import Floats
 from pliant.solver.refinement.learned import START_EM_ROUNDS, Learned, turned_once
+from pliant.solver.tracks.completion import often_visible
 from pliant.solver.tracks.normalization import Normalized
 
 ROUNDS = 3
@@ -44,6 +45,9 @@ class Observed:
     chosen: NDArray[np.intp]
     """Indices of the sampled points, shape `(S,)`."""
 
+    often: NDArray[np.bool_]
+    """Mask of the often visible points, shape `(S,)`: their mean is the origin of the depths."""
+
     view: Perspective | None
     """Perspective at the frames used; None where tracks are not corrected."""
 
@@ -56,7 +60,8 @@ class Observed:
         weight = np.where(estimate.filling.outliers(points, confidence), 0.0, confidence)
         view = estimate.perspective
         view = replace(view, offsets=view.offsets[used]) if view is not None and view.bends else None
-        return cls(points[used], confidence[used], weight[used], chosen, view)
+        often = often_visible(normalized.visible)[chosen]
+        return cls(points[used], confidence[used], weight[used], chosen, often, view)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,5 +196,5 @@ def _corrected(observed: Observed, found: Learned, before: Moments, start_scales
     complete = before.sample * start_scales[:, None, None]
     depth = depth_map(found.rotations, found.scales * start_scales, found.covariance)
     depths = depth @ complete.transpose(0, 2, 1).reshape(2 * len(complete), -1)
-    depths -= depths.mean(axis=1, keepdims=True)
+    depths -= depths[:, observed.often].mean(axis=1, keepdims=True)
     return corrected(observed.points + view.offsets[:, None], depths, view.curvature) - view.offsets[:, None]

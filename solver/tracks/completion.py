@@ -81,7 +81,7 @@ class Completed:
     """Completed tracks, centred per frame."""
 
     gram: Floats
-    """W Wᵀ / P over all points, shape `(2F, 2F)`."""
+    """W Wᵀ / P over the often visible points, shape `(2F, 2F)`."""
 
     sample: Floats
     """Sampled points, shape `(F, S, 2)`, normalized units."""
@@ -145,6 +145,23 @@ def choose_points(visible: NDArray[np.floating[Any]], random: np.random.Generato
     half = random.choice(often, min(MAX_SAMPLE_POINTS // 2, len(often)), replace=False)
     rest = random.choice(np.setdiff1d(usable, half), MAX_SAMPLE_POINTS - len(half), replace=False)
     return np.sort(np.concatenate([half, rest]))
+
+
+def often_visible(visible: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
+    """Return a mask of the points whose completed tracks cameras and focal length are estimated from, shape `(P,)`.
+
+    A point that an object turns out of sight is hidden over many consecutive frames, where completion extrapolates it without perspective.
+    With all points of a head that hides itself (27 % of the entries), the focal length is 2.7 times too long and the error .050; with these
+    points .0035. A point is used if some frame shows it, and it is visible in at least half of all frames, or as often as the median
+    point that this frame shows. So every frame keeps half of its points, however short the tracks are.
+    """
+    seen = visible > 0
+    count = seen.sum(axis=0)
+    often = np.zeros(len(count), dtype=bool)
+    for shown in seen:
+        if shown.any():
+            often |= shown & (count >= min(len(seen) / 2, float(np.median(count[shown]))))
+    return np.asarray(often & (count >= min(2, int(count.max()))))
 
 
 def ranks(points: Floats) -> NDArray[np.intp]:
@@ -293,13 +310,20 @@ def gross(points: Floats, weight: Floats, predicted: Floats, scale: float) -> ND
     )
 
 
-def spans(normalized: Normalized, filling: Filling | None) -> Iterator[tuple[NDArray[np.intp], Floats]]:
-    """Yield the completed points in chunks, as indices `(n,)` and positions `(F, n, 2)`; skip points that are never visible."""
+def spans(
+    normalized: Normalized, filling: Filling | None, among: NDArray[np.bool_] | None = None
+) -> Iterator[tuple[NDArray[np.intp], Floats]]:
+    """Yield the completed points, or those of the mask `among`, in chunks, as indices `(n,)` and positions `(F, n, 2)`.
+
+    Points that are never visible are skipped.
+    """
     count = normalized.visible.shape[1]
     for start in range(0, count, POINTS_PER_CHUNK):
         span = slice(start, min(start + POINTS_PER_CHUNK, count))
         points, weight = normalized.points[:, span], normalized.visible[:, span]
-        shown = (weight > 0).any(axis=0)
+        shown = (weight > 0).any(axis=0) if among is None else among[span]
+        if not shown.any():
+            continue
         points, weight = points[:, shown], weight[:, shown]
         if filling is not None:
             points, _ = fill(points, weight, filling.basis, filling.spread, filling.scale)
@@ -314,7 +338,7 @@ def _carry(
     gram, total = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2))
     sample = np.zeros((frames, len(chosen), 2))
     used = 0
-    for number, (places, points) in enumerate(spans(normalized, filling), start=1):
+    for number, (places, points) in enumerate(spans(normalized, filling, often_visible(normalized.visible)), start=1):
         if number % CHUNKS_PER_TICK == 0 and tick is not None:
             tick()
         stacked = points.transpose(0, 2, 1).reshape(2 * frames, -1)

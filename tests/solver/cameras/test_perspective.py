@@ -83,8 +83,9 @@ def test_corrected_tracks_do_not_depend_on_the_size_of_chunks(chunk: int, monkey
     random, normalized = np.random.default_rng(7), normalize(pinhole(SEEN, FOCAL))
     covariance = ShapeCovariance(np.eye(3), np.eye(3), 0.1 * random.normal(size=(len(SEEN), 2)), 1e-4, 1e-4, 0.0)
     offsets = (normalized.centroid - CENTRE) / normalized.unit
+    sample = normalized.points[:, ::3] + offsets[:, None]
     view = Perspective(
-        offsets, CENTRE, curvature=normalized.unit / FOCAL, sample=normalized.points[:, ::3] + offsets[:, None],
+        offsets, CENTRE, curvature=normalized.unit / FOCAL, sample=sample, whole=sample,
         depth=depth_map(FACE.rotations, np.ones(len(SEEN)), covariance),
     )  # fmt: skip
     assert normalized.points.shape[1] < completion.POINTS_PER_CHUNK
