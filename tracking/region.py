@@ -187,7 +187,8 @@ def _from_polygon(given: ArrayLike, size: tuple[int, int]) -> Grey:
     far = np.flatnonzero(~(np.abs(corners) <= FARTHEST).all(axis=1))  # NaN as well
     if far.size:
         raise _wrong_polygon("the corner ({:g}, {:g})".format(*corners[far[0]]))
-    if np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)[1] < 1:
+    along, across = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
+    if across <= 1e-6 * along:
         raise _wrong_polygon("corners on one line")
     mask = np.zeros(size[::-1], dtype=np.uint8)
     cv2.fillPoly(mask, [np.round(corners).astype(np.int32)], 255)

@@ -44,7 +44,7 @@ ROOMS = {
 
 ELSEWHERE = {
     "bas_relief": ("flag",), "planar_ambiguity": ("flag",), "focal_length": ("face, lens",), "perspective": ("face, lens",),
-    "affine_iterations": ("face, lens",), "depth_alternation": ("face, lens",), "depth_rounds": ("face, lens",), "lens": ("face, lens",),
+    "affine_iterations": ("face, lens",), "depth_alternation": ("face, lens",), "depth_rounds": ("face, lens",),
     "resection": ("face, lens",), "completion": ("face, errors",), "noise": ("face, errors",), "observation_model": ("face, errors",),
     "observed": ("face, errors",),
 }  # fmt: skip
