@@ -315,7 +315,7 @@ CASES: dict[str, Case] = {
     "a selection of two frames": Case(options={"frames": "0:2"},
         words="options.frames: expected at least 3 of the 6 frames, got 2 by 0:2. Widen the range, or omit frames to use all of them."),
     "a stride that leaves one point": Case(mesh="4x5", options={"stride": 1000},
-        words="options.stride: expected a stride that leaves 4 points or more, got 1 at stride 1000. Use a smaller stride, or a larger max_points."),
+        words="options.stride: expected a value that leaves 4 points or more, got 1 of 20. Use a smaller stride."),
     "points that are seen too seldom": Case(options={"min_seen": 7},
         words="options.min_seen: expected points that are visible in 7 or more frames, got none of 20. Set min_seen lower."),
     "a mesh of other arrays": Case(mesh=lambda: npz(vertices=np.ones((20, 3))),
