@@ -31,8 +31,7 @@ def check_agreement(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | No
         `laplacian="grid8"` with a mesh that is not a grid, `surface="isometric"` with given cameras, `camera="orthographic"` with given
         scales that are not 1, or `order="any"` with more than `MAX_UNORDERED_FRAMES` frames.
     """
-    if mesh is not None:
-        _check_mesh(tracks, mesh, settings)
+    check_mesh(tracks, mesh, settings)
     if cameras is not None:
         _check_cameras(tracks, cameras, settings)
     if settings.order == "any" and tracks.num_frames > MAX_UNORDERED_FRAMES:
@@ -42,6 +41,30 @@ def check_agreement(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | No
         )  # fmt: skip
     if settings.image_size is not None:
         _check_picture(tracks, settings.image_size)
+
+
+def check_mesh(tracks: Tracks, mesh: Mesh | None, settings: Settings) -> None:
+    """Check that a mesh matches the tracks, all of them or a block of points, and the settings the mesh.
+
+    Raises
+    ------
+    InvalidInput
+        Number of vertices (code `mesh_mismatch`).
+    InvalidSettings
+        `laplacian="grid8"` with a mesh that is not a grid.
+    """
+    if mesh is None:
+        return
+    if mesh.num_points != tracks.num_points:
+        raise InvalidInput(
+            "mesh_mismatch", field="mesh", expected=f"{tracks.num_points} vertices, one for each point of the tracks",
+            got=f"{mesh.num_points}", hint="Vertex i of the mesh must be point i of the tracks.",
+        )  # fmt: skip
+    if settings.laplacian == "grid8" and mesh.grid is None and len(mesh.faces) > 0:
+        raise InvalidSettings(
+            "invalid_option", field="options.laplacian", expected="a mesh that is a pixel grid", got="faces only",
+            hint="Use laplacian auto, uniform or cotangent, or give the points as a grid.",
+        )  # fmt: skip
 
 
 def check_seen(visible: Floats) -> None:
@@ -87,19 +110,6 @@ def check_principal_point(centroids: Floats, unit: float, point: Floats) -> None
             "principal_point_far", field="options.principal_point",
             expected=f"a point within {MAX_CENTRE_RADII:.0f} RMS radii of the tracks",
             got=f"({point[0]:.5g}, {point[1]:.5g})", hint="Give x, y in the unit and axes of the tracks.",
-        )  # fmt: skip
-
-
-def _check_mesh(tracks: Tracks, mesh: Mesh, settings: Settings) -> None:
-    if mesh.num_points != tracks.num_points:
-        raise InvalidInput(
-            "mesh_mismatch", field="mesh", expected=f"{tracks.num_points} vertices, one for each point of the tracks",
-            got=f"{mesh.num_points}", hint="Vertex i of the mesh must be point i of the tracks.",
-        )  # fmt: skip
-    if settings.laplacian == "grid8" and mesh.grid is None and len(mesh.faces) > 0:
-        raise InvalidSettings(
-            "invalid_option", field="options.laplacian", expected="a mesh that is a pixel grid", got="faces only",
-            hint="Use laplacian auto, uniform or cotangent, or give the points as a grid.",
         )  # fmt: skip
 
 

@@ -230,7 +230,9 @@ def corrected_moments(view: Perspective, normalized: Normalized) -> tuple[Floats
     frames = len(normalized.points)
     gram, total, used = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2)), 0
     origin = mean_depth(view)
-    for _, points in spans(normalized, view.filling, often_visible(normalized.visible)):
+    often = often_visible(normalized.visible)
+    for places, points in spans(normalized, view.filling):
+        points = points[:, often[places]]
         changed = _corrected_by(view, points + view.offsets[:, None], origin) - view.offsets[:, None]
         stacked = columns(changed)
         gram += stacked @ stacked.T

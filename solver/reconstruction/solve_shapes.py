@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from pliant.solver.agreement import check_agreement
+from pliant.solver.agreement import check_mesh
 from pliant.solver.mesh import Mesh
 from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.blocks import needs_blocks, shapes_in_blocks
@@ -83,7 +83,7 @@ def solve_shapes(
         check_shapes(first, tracks)
         first = first * observations.world_scale
     settings = settings if settings is not None else observations.settings
-    check_agreement(tracks, mesh, None, settings)
+    check_mesh(tracks, mesh, settings)
     settings = without_learned_prior(settings) if prior is None else settings
     monitor = monitored(tracks, None, settings, on_step, should_stop, only=("shapes", "finish", "trust"))
     with pulses_to(monitor.pulse):

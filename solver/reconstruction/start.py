@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.agreement import check_agreement
+from pliant.solver.agreement import check_mesh
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import orthographic
 from pliant.solver.energy.problem import Problem
@@ -140,7 +140,7 @@ def prepared(
     """
     observations = cameras.observations.of(tracks)
     settings = observations.settings if settings is None else settings
-    check_agreement(tracks, mesh, None, settings)
+    check_mesh(tracks, mesh, settings)
     if prior is None:
         estimate, covariance = cameras.estimate, None
         settings = without_learned_prior(settings)

@@ -87,7 +87,7 @@ class Completed:
     """Sampled points, shape `(F, S, 2)`, normalized units."""
 
     translations: Floats
-    """Centroid of the completed points minus centroid of the visible points, per frame, shape `(F, 2)`."""
+    """Centroid of the often visible points, completed, minus centroid of the visible points, per frame, shape `(F, 2)`."""
 
     rank: int
     """Number of columns of the basis, translation included; 0 if nothing was filled."""
@@ -310,20 +310,13 @@ def gross(points: Floats, weight: Floats, predicted: Floats, scale: float) -> ND
     )
 
 
-def spans(
-    normalized: Normalized, filling: Filling | None, among: NDArray[np.bool_] | None = None
-) -> Iterator[tuple[NDArray[np.intp], Floats]]:
-    """Yield the completed points, or those of the mask `among`, in chunks, as indices `(n,)` and positions `(F, n, 2)`.
-
-    Points that are never visible are skipped.
-    """
+def spans(normalized: Normalized, filling: Filling | None) -> Iterator[tuple[NDArray[np.intp], Floats]]:
+    """Yield the completed points in chunks, as indices `(n,)` and positions `(F, n, 2)`; skip points that are never visible."""
     count = normalized.visible.shape[1]
     for start in range(0, count, POINTS_PER_CHUNK):
         span = slice(start, min(start + POINTS_PER_CHUNK, count))
         points, weight = normalized.points[:, span], normalized.visible[:, span]
-        shown = (weight > 0).any(axis=0) if among is None else among[span]
-        if not shown.any():
-            continue
+        shown = (weight > 0).any(axis=0)
         points, weight = points[:, shown], weight[:, shown]
         if filling is not None:
             points, _ = fill(points, weight, filling.basis, filling.spread, filling.scale)
@@ -337,16 +330,17 @@ def _carry(
     frames = len(normalized.points)
     gram, total = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2))
     sample = np.zeros((frames, len(chosen), 2))
-    used = 0
-    for number, (places, points) in enumerate(spans(normalized, filling, often_visible(normalized.visible)), start=1):
+    used, often = 0, often_visible(normalized.visible)
+    for number, (places, points) in enumerate(spans(normalized, filling), start=1):
         if number % CHUNKS_PER_TICK == 0 and tick is not None:
             tick()
+        inside = np.isin(places, chosen, assume_unique=True)
+        sample[:, np.isin(chosen, places, assume_unique=True)] = points[:, inside]
+        points = points[:, often[places]]
         stacked = points.transpose(0, 2, 1).reshape(2 * frames, -1)
         gram += stacked @ stacked.T
         total += points.sum(axis=1)
         used += points.shape[1]
-        inside = np.isin(places, chosen, assume_unique=True)
-        sample[:, np.isin(chosen, places, assume_unique=True)] = points[:, inside]
     mean = total / used
     flat = mean.reshape(-1)
     return gram / used - np.outer(flat, flat), mean, sample - mean[:, None]

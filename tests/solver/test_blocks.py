@@ -285,3 +285,17 @@ def test_memory_per_observation_is_bounded_at_once_and_in_blocks() -> None:
 
     assert at_once < 360
     assert in_blocks < 180
+
+
+@pytest.mark.usefixtures("limited")
+def test_a_block_of_points_may_lie_outside_the_picture(film: gallery.Sequence) -> None:
+    x = film.tracks.points[..., 0]
+    moved = Tracks.from_arrays(film.tracks.points - film.tracks.points.min(axis=(0, 1)))
+    size = (float(np.quantile(x - x.min(), 0.75)), float(np.ptp(film.tracks.points[..., 1])) + 1)
+    groups = blocks.blocks(moved, 3)
+    inside = [(moved.points[:, own, 0] < size[0]).mean() for own in groups]
+    assert min(inside) < 0.5 < float((moved.points[..., 0] < size[0]).mean())
+    solved = solve(
+        moved, film.mesh, cameras=given(film), settings=Settings(prior="smooth", image_size=size, max_reweightings=1)
+    )
+    assert np.isfinite(solved.shapes).all()

@@ -90,7 +90,7 @@ def check_stored(path: Path, options: Options, limits: Limits) -> None:
     InvalidInput
         They contradict each other; too_large when reading needs more memory or time than the limits allow.
     """
-    if path.stat().st_size <= LARGE:
+    if declared_bytes(path, field="inputs_of") <= LARGE:
         _check_here(path, options)
     else:
         _in_process({STORED: path}, options, limits, None)

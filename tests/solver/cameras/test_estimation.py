@@ -10,6 +10,7 @@ from pliant.solver.cameras import estimation, multistart
 from pliant.solver.cameras.estimation import estimate_cameras, given_cameras
 from pliant.solver.cameras.factorization import upgrade, upgrades
 from pliant.solver.cameras.multistart import carried
+from pliant.solver.cameras.perspective import columns
 from pliant.solver.model.camera_motion_prior import (
     SCALE_FLOOR,
     STEADY,
@@ -24,7 +25,7 @@ from pliant.solver.model.so3 import (
     logarithm,
     start_at_identity,
 )
-from pliant.solver.tracks.completion import RANKS, complete, often_visible
+from pliant.solver.tracks.completion import RANKS, complete, often_visible, spans
 from pliant.solver.tracks.normalization import normalize
 
 
@@ -94,6 +95,15 @@ def test_a_still_camera_is_reported() -> None:
     still = np.broadcast_to(np.eye(3), (8, 3, 3))
     found = estimate_cameras(normalize(Tracks.from_arrays(view(RIGID, still))), Settings())
     assert any("hardly turns" in sentence for sentence in found.warnings)
+
+
+def test_a_roll_about_the_viewing_direction_is_no_turn() -> None:
+    angles = np.radians(np.linspace(0, 60, 8))
+    rolled, zero, one = np.cos(angles), np.zeros(8), np.ones(8)
+    rows = [[rolled, -np.sin(angles), zero], [np.sin(angles), rolled, zero], [zero, zero, one]]
+    assert estimation._warnings(np.array(rows).transpose(2, 0, 1))
+    turned = np.array([[one, zero, zero], [zero, rolled, -np.sin(angles)], [zero, np.sin(angles), rolled]])
+    assert estimation._warnings(turned.transpose(2, 0, 1)) == ()
 
 
 @pytest.mark.parametrize(("frames", "points"), [(3, 4), (3, 60), pytest.param(20, 4, marks=pytest.mark.long)])
@@ -203,19 +213,23 @@ def test_swinging_limbs_do_not_make_the_cameras_jitter() -> None:
     assert refined.reasons["rotations"].startswith("Refined by variable projection")
 
 
-@pytest.mark.parametrize(("frames", "points", "most"), [(40, 300, 0.09), (60, 400, 0.115)])
+@pytest.mark.parametrize(("frames", "points", "most"), [(40, 300, 0.09), (60, 400, 0.11)])
 @pytest.mark.slow
 def test_tracks_of_a_self_occluding_body_are_completed(frames: int, points: int, most: float) -> None:
-    # no point is always seen; measured on the often visible points: .112 for 60 frames
+    # no point is always seen: without a prior on the coefficients, sparsely observed points diverge (.105 and .123)
     body = gallery.sphere(frames, points)
     normalized = normalize(body.tracks)
     whole = view(body.shapes, body.rotations) * body.scales[:, None, None] / normalized.unit
     rows = (whole - whole.mean(axis=1, keepdims=True)).transpose(0, 2, 1).reshape(2 * frames, -1)
-    rows = rows[:, often_visible(normalized.visible)]
-    rows = rows - rows.mean(axis=1, keepdims=True)
-    truth = rows @ rows.T / rows.shape[1]
+    truth = rows @ rows.T / points
     found = complete(normalized)
-    missed = np.linalg.norm(found.gram - truth) / np.linalg.norm(truth)
+    ((places, completed),) = spans(normalized, found.filling)
+    filled = columns(completed)
+    filled = filled - filled.mean(axis=1, keepdims=True)
+    missed = np.linalg.norm(filled @ filled.T / len(places) - truth) / np.linalg.norm(truth)
+    often = filled[:, often_visible(normalized.visible)[places]]
+    often = often - often.mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(found.gram, often @ often.T / often.shape[1], atol=1e-12)
     assert 0.01 < missed < most
     np.testing.assert_array_equal(
         complete(normalized, rank=found.rank).gram, found.gram

@@ -12,7 +12,7 @@ from pliant.solver.evaluation.metrics import reprojection
 from pliant.solver.evaluation.trust import per_frame
 from pliant.solver.isometry import focal_sweep
 from pliant.solver.isometry.anchors import Anchors, connected, nearest_neighbours
-from pliant.solver.isometry.extension import complete_anchors, flatten, spline
+from pliant.solver.isometry.extension import complete_anchors, extend, flatten, spline
 from pliant.solver.isometry.focal_sweep import FocalSearch, Tried
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import (
@@ -392,3 +392,26 @@ def test_hidden_anchors_follow_the_most_similar_frame() -> None:
     completed, enough = complete_anchors(spoiled, seen, sheet.flat)
     np.testing.assert_allclose(completed, points, atol=1e-6)
     assert enough.all()
+
+
+@pytest.mark.parametrize("shift", [(1500.0, -1500.0), (-320.0, 900.0)])
+def test_the_dense_extension_does_not_depend_on_where_the_sheet_lies_in_the_picture(shift: tuple[float, float]) -> None:
+    sheet = rolled(frames=6, side=9)
+    images, spatial = np.array(sheet.tracks.points), np.asarray(sheet.points)
+    seen, anchors = np.ones(images.shape[:2], dtype=bool), np.arange(0, images.shape[1], 2)
+    random = np.random.default_rng(0)
+    wrong = random.random(seen.shape) < 0.05
+    wrong[:, anchors] = False
+    images[wrong] += random.normal(scale=12.0, size=(wrong.sum(), 2))
+    rows, across = np.divmod(np.arange(81), 9)
+    template = np.stack([rows, across], axis=1).astype(float)[anchors]
+
+    def extended(moved: np.ndarray) -> np.ndarray:
+        found = extend(
+            images + moved, seen, images=images[:, anchors] + moved, known=seen[:, anchors], anchors=spatial[:, anchors],
+            template=template - template.mean(axis=0), focal=FOCAL, centre=np.asarray(CENTRE) + moved,
+        )  # fmt: skip
+        assert found.outliers[wrong].mean() > 0.8
+        return found.points
+
+    np.testing.assert_allclose(extended(np.array(shift)), extended(np.zeros(2)), rtol=1e-6)

@@ -169,3 +169,9 @@ def test_unsupported_order_settings_are_rejected() -> None:
     settings, why = resolved_order(many, Settings())
     assert settings.order == "film"
     assert "too many" in why
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_the_order_by_content_does_not_depend_on_the_unit(unit: float) -> None:
+    between = np.array([[0, 2, np.inf, 5], [2, 0, 3, np.inf], [np.inf, 3, 0, 1], [5, np.inf, 1, 0.0]])
+    assert content_order(between * unit).tolist() == content_order(between).tolist()
