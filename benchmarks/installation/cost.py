@@ -36,7 +36,7 @@ SIZES = (
 )
 """Frames and points."""
 
-NEAR_SIZES, DISTANCE, NOISE = ((50, 500), (100, 300)), 5.0, 0.5
+NEAR_SIZES, DISTANCE, NOISE = ((30, 300), (30, 1_500), (60, 500), (120, 1_000)), 5.0, 0.5
 """Frames and points; distance of the camera in half-sizes; standard deviation of the noise, px."""
 
 
@@ -56,19 +56,23 @@ def measure(frames: int, points: int) -> None:
 
 
 def near() -> None:
-    """Print the times of near faces relative to the same far face."""
+    """Print the times of solves with a known picture size, from nearby and afar, and their estimate."""
+    print(f"{'frames × points':>17} {'near':>6} {'20 % hidden':>12} {'far, hidden':>12} {'estimate':>9}")
     for frames, points in NEAR_SIZES:
         case = from_gallery(gallery.face(frames, points, degrees=40), "face")
-        far = _seconds(case, float("inf"), Spoiling(noise=NOISE), None)
-        noisy = _seconds(case, DISTANCE, Spoiling(noise=NOISE), PICTURE)
-        hidden = _seconds(case, DISTANCE, Spoiling(noise=NOISE, hidden=0.2), PICTURE)
-        print(f"{frames:>6} × {points:<8,} {noisy / far:>6.1f} {hidden / far:>6.1f}", flush=True)
+        hidden = Spoiling(noise=NOISE, hidden=0.2)
+        near = _seconds(case, DISTANCE, Spoiling(noise=NOISE)), _seconds(case, DISTANCE, hidden)
+        far = _seconds(case, float("inf"), hidden)
+        size = f"{PICTURE[0]:.0f}x{PICTURE[1]:.0f}"
+        guess = estimated(frames, len(case.tracks.points[0]), Options(image_size=size)).seconds
+        print(f"{frames:>6} × {points:<8,} {near[0]:>6.1f} {near[1]:>12.1f} {far:>12.1f} {guess:>9.1f}", flush=True)
 
 
-def _seconds(case: Case, distance: float, spoiling: Spoiling, picture: tuple[float, float] | None) -> float:
+def _seconds(case: Case, distance: float, spoiling: Spoiling) -> float:
     tracks = spoiled(seen_from(case, distance)[0], spoiling)
     began = time.process_time()
-    solve(tracks, case.mesh, settings=Settings(image_size=picture))
+    with threads_limited(1):
+        solve(tracks, case.mesh, settings=Settings(image_size=PICTURE))
     return time.process_time() - began
 
 
@@ -76,8 +80,8 @@ def main() -> None:
     """Measure what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--near", action="store_true", help="time of the solver where perspective is found, relative to the same face far away: "
-        "with noise, and with 20 %% hidden observations on top",
+        "--near", action="store_true", help="time of the solver with a known picture size: near the camera with noise, with 20 %% hidden "
+        "observations on top, and these far away",
     )  # fmt: skip
     parser.add_argument(
         "--measure", type=int, nargs=2, metavar=("FRAMES", "POINTS"), help="one job, in this process; prints JSON"
