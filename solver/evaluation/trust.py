@@ -151,7 +151,7 @@ def assess(
     planar : bool
         Whether the tracks show a sheet, whose pose signs are weakly determined.
     modes : int
-        Number of modes of deformation of the prior.
+        Number of modes of deformation of the prior that exceed the noise.
     depth_is_typical : bool
         Whether a prior, not the tracks, determines the extent of depth.
     shown : ndarray of bool, shape (F,), optional

@@ -69,6 +69,15 @@ class ShapeCovariance:
         walk = random_walk_at(used, len(self.modes), self.ordered)
         return np.asarray(modes @ modes.T + self.walk_variance * walk)
 
+    def num_deforming(self) -> int:
+        """Return the number of independent deformations whose variance, as a mean over frames, exceeds that of the noise.
+
+        Modes below it fit noise. A mode that is constant over time belongs to the mean position and does not count.
+        """
+        moving = self.modes - self.modes.mean(axis=0)
+        variances = np.linalg.svd(moving, compute_uv=False) ** 2 / len(moving)
+        return int((variances * np.trace(self.axis_covariance) / 3 > self.noise_variance).sum())
+
     def times(self, columns: Floats) -> Floats:
         """Return C times columns of shape `(F, n)`, in time and memory linear in F."""
         deformed = self.modes @ (self.modes.T @ columns)

@@ -119,7 +119,7 @@ def judged(
         held_out_error=held_out_error,
         ordered=estimate.ordered,
         planar=is_planar(estimate.gram) or on_one_line(tracks),
-        modes=0 if covariance is None else covariance.modes.shape[1],
+        modes=0 if covariance is None else covariance.num_deforming(),
         depth_is_typical=estimate.depth_is_typical,
         shown=informative_frames(confidence),
         behind=frames_behind(solution.camera, solution.shapes),

@@ -12,10 +12,10 @@ image v = w / (1 + κz), relative to the principal point, has the derivative
     ∂v/∂x = (s_f R_f[:2] − κ v ⊗ s_f R_f[2]) / (1 + κz),
 
 which replaces Π and differs from point to point; it is evaluated at one representative of each compact part of the object. The variances
-of points that are visible in all frames, or in none, which have the prior's, are exact, and so are those of a sample of the others. From
-this sample, the ratio of the variance of a position to that of a point visible in all frames is estimated, as a function of the number of
-frames to the nearest observation; it predicts the variances of the remaining points. Cameras are taken as known, so the standard deviations
-are lower bounds where few frames or little motion leave the cameras uncertain.
+of points that are visible in all frames, or in none, which have the prior's, are exact, and so are those of a sample of the others. For the
+remaining points, the ratio of the variance of a position to that of a point visible in all frames is the mean of the ratios of the sampled
+points with the most similar visibility. Cameras are taken as known, so the standard deviations are lower bounds where few frames or little
+motion leave the cameras uncertain.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.pulse import pulse
 from pliant.solver.records import Camera, Floats
 from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE
 from pliant.solver.tracks.frame_selection import between, evenly_spread
@@ -39,12 +40,16 @@ the standard deviations."""
 MAX_OPERATIONS = 2e10
 """Maximum number of floating-point operations for visibility patterns: a few seconds on one core."""
 
-MAX_PATTERNS = 128
-"""Maximum number of patterns evaluated."""
+MAX_PATTERNS = 1000
+"""Maximum number of patterns evaluated; most sequences have fewer points, and all of them are exact."""
 
-GAPS = (0, 1, 2, 4, 8, 16, 32)
-"""Bounds of the classes of positions, in frames to the nearest frame that shows the point."""
+SIMILAR_PATTERNS = 3
+"""Number of evaluated patterns from which the variances of another point are predicted. With 46 of 754 points evaluated, the RMS difference of
+the logarithm from the exact standard deviation is .19 where an object hides itself (.20 with one pattern), and .37 where tracks begin and
+end anywhere (.50)."""
 
+PATTERNS_AT_ONCE = 4096
+"""Points compared with the evaluated patterns at once; bounds the memory at 4 million distances."""
 
 REPRESENTATIVES = 24
 """Number of points at which the derivative of a perspective image is evaluated. On a face 3 half-sizes away, the median standard deviation
@@ -201,6 +206,7 @@ def _moments(covariance: ShapeCovariance, projections: Floats, used: NDArray[np.
 
 def _variance(prior: Floats, crossed: Floats, image: Floats, weights: Floats, noise: float) -> Floats:
     """Return the trace of the posterior covariance of each frame's position, shape `(F,)`, for one visibility pattern."""
+    pulse()
     seen = np.flatnonzero(np.repeat(weights > 0, 2))
     if len(seen) == 0:
         return prior
@@ -221,25 +227,22 @@ def _sample(weights: Floats, seed: int) -> NDArray[np.intp]:
 
 
 def _predicted(everything: Floats, weights: Floats, sample: NDArray[np.intp], exact: Floats) -> Floats:
-    """Return variances `(F, P)`: exact ones for the sample, elsewhere `everything` times the mean ratio of the position's class."""
-    kind = np.digitize(_gaps(weights), GAPS[1:])
-    rounding = np.finfo(float)
-    ratio = exact / np.maximum(everything[:, sample], np.maximum(rounding.eps * exact, rounding.tiny))
-    sampled = kind[:, sample]
-    factors = np.ones(len(GAPS))
-    for each in range(len(GAPS)):
-        chosen = ratio[sampled == each]
-        factors[each] = chosen.mean() if chosen.size else (factors[each - 1] if each else 1.0)
-    found = everything * np.maximum.accumulate(factors)[kind]
+    """Return variances `(F, P)`: exact ones for the sample, elsewhere `everything` times the ratios of similar patterns.
+
+    The mean of the logarithms is weighted by the inverse squared distance between patterns (Shepard 1968), so an equal pattern has all weight.
+    """
+    rounding, known = np.finfo(float), weights[:, sample]
+    ratio = np.log(exact / np.maximum(everything[:, sample], np.maximum(rounding.eps * exact, rounding.tiny)))
+    found, squares, count = everything.copy(), np.square(known).sum(axis=0), min(SIMILAR_PATTERNS, len(sample))
+    others = np.setdiff1d(np.arange(weights.shape[1]), sample)
+    for start in range(0, len(others), PATTERNS_AT_ONCE):
+        some = others[start : start + PATTERNS_AT_ONCE]
+        pulse()
+        own = weights[:, some]
+        distance = np.square(own).sum(axis=0)[:, None] + squares - 2 * own.T @ known
+        similar = np.argpartition(distance, count - 1, axis=1)[:, :count]
+        nearness = 1 / np.maximum(np.take_along_axis(distance, similar, axis=1), 1e-9 * len(known))
+        nearness /= nearness.sum(axis=1, keepdims=True)
+        found[:, some] *= np.exp(np.einsum("fpk,pk->fp", ratio[:, similar], nearness))
     found[:, sample] = exact
-    return np.asarray(found)
-
-
-def _gaps(weights: Floats) -> Floats:
-    """Return for each position the number of frames to the nearest frame that shows the point; ∞ if none does."""
-    frames = len(weights)
-    at = np.where(weights > 0, np.arange(frames)[:, None], -np.inf)
-    before = np.maximum.accumulate(at, axis=0)
-    after = -np.maximum.accumulate(np.where(weights > 0, -np.arange(frames)[:, None], -np.inf)[::-1], axis=0)[::-1]
-    here = np.arange(frames)[:, None]
-    return np.asarray(np.minimum(here - before, after - here), dtype=np.float64)
+    return found

@@ -232,3 +232,13 @@ def test_modes_and_walk_reproduce_a_covariance_of_their_form(ordered: bool) -> N
     found, variance = expectation_maximisation._split(over_frames, 1e-9, 8, ordered=ordered)
     assert found.shape == (12, 3)
     np.testing.assert_allclose(found @ found.T + variance * random_walk(12, ordered), over_frames, atol=1e-12)
+
+
+def test_only_modes_that_move_by_more_than_the_noise_count_as_deformations() -> None:
+    truth, _, _ = drawn()
+    assert truth.num_deforming() == 2
+    turned = replace(truth, modes=truth.modes @ np.array([[0.6, -0.8], [0.8, 0.6]]))
+    assert turned.num_deforming() == 2, "another basis of the same modes"
+    assert replace(truth, modes=np.hstack([truth.modes, np.full((FRAMES, 1), 0.5)])).num_deforming() == 2
+    assert replace(truth, noise_variance=0.01).num_deforming() == 1
+    assert replace(truth, modes=np.zeros((FRAMES, 0))).num_deforming() == 0

@@ -150,7 +150,23 @@ def test_std_predicted_from_sampled_patterns_is_close_to_exact(monkeypatch: pyte
     predicted = position_std(given, pairs, confidence, noise_std=NOISE)
     assert np.array_equal(predicted, position_std(given, pairs, confidence, noise_std=NOISE)), "it is deterministic"
     assert not np.array_equal(predicted, exact)
-    assert np.median(np.abs(np.log(predicted / exact))) < 0.2
+    assert np.median(np.abs(np.log(predicted / exact))) < 0.1
+
+
+@pytest.mark.parametrize("confidence", [1.0, 0.3])
+def test_points_with_short_tracks_get_the_std_of_similar_tracks(
+    monkeypatch: pytest.MonkeyPatch, confidence: float
+) -> None:
+    frames, points = 24, 400
+    given, pairs = covariance(3, frames), projections(frames)
+    first, last = np.sort(np.random.default_rng(4).integers(0, frames, (points, 2)), axis=1).T
+    shown = (np.arange(frames)[:, None] >= first) & (np.arange(frames)[:, None] <= last)
+    weights = np.where(np.arange(points) % 2 == 0, 1.0, confidence) * shown
+    exact = position_std(given, pairs, weights, noise_std=NOISE)
+    monkeypatch.setattr(uncertainty, "MAX_PATTERNS", 100)
+    off = np.log(position_std(given, pairs, weights, noise_std=NOISE) / exact)
+    assert np.sqrt(np.mean(off**2)) < 0.2
+    assert abs(off[shown].mean()) < 0.05
 
 
 def test_points_visible_in_all_frames_or_in_none_have_the_exact_std_beside_rarely_visible_ones(
