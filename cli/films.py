@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pliant.cli.session import LINE_EVERY
-from pliant.cli.show import err, out, show_warnings
+from pliant.cli.show import err, needs, out, show_warnings
 
 if TYPE_CHECKING:
     from pliant.schemas.options import Options
@@ -64,7 +64,7 @@ def refuse_parts_of_tracks(**parts: object) -> None:
 
 
 def inspect_film(film: Path, *, region: Path | None, options: dict[str, Any], as_json: bool) -> None:
-    """Print a film's properties, and an estimate of its tracked points and tracking time.
+    """Print a film's properties, and estimates of its tracked points, and of the time and memory that it needs.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def inspect_film(film: Path, *, region: Path | None, options: dict[str, Any], as
     from rich.text import Text
 
     table = Table.grid(padding=(0, 2))
-    for name, words in film_rows(facts):
+    for name, words in film_rows(facts, checked):
         table.add_row(Text(name, "dim"), Text(words))
     out().print(table)
     show_warnings(warnings)
@@ -100,8 +100,11 @@ def warnings_of_check(facts: FilmFacts, region: Path | None, options: Options) -
     return warnings_unread(whole=region is None and options.region_polygon is None, frames=facts.frames)
 
 
-def film_rows(facts: FilmFacts) -> list[tuple[str, str]]:
-    """Return a film's properties as pairs of label and text."""
+def film_rows(facts: FilmFacts, options: Options) -> list[tuple[str, str]]:
+    """Return a film's properties, and what tracking and reconstruction will need, as pairs of label and text."""
+    from pliant.worker.films.tracker import film_options
+    from pliant.worker.formats.cost import estimated
+
     of_all = f" of {facts.stated_frames}" if facts.frames != facts.stated_frames else ""
     rows = [
         ("film", facts.container),
@@ -118,6 +121,19 @@ def film_rows(facts: FilmFacts) -> list[tuple[str, str]]:
     rows.append(("points", f"about {facts.points}" if facts.points else "none: no texture in the region"))
     if facts.track_seconds:
         rows.append(("tracking", f"about {facts.track_seconds:.0f} s on this machine"))
+    if facts.points and facts.frames:
+        rows.append(
+            (
+                "reconstruction",
+                needs(
+                    estimated(
+                        facts.frames,
+                        min(facts.points, options.max_points or facts.points),
+                        film_options(options, facts),
+                    )
+                ),
+            )
+        )
     return rows
 
 

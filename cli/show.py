@@ -12,7 +12,7 @@ from rich.text import Text
 
 if TYPE_CHECKING:
     from pliant.cli.exits import Exit
-    from pliant.schemas.job import Interpretation, Job
+    from pliant.schemas.job import Estimate, Interpretation, Job
     from pliant.worker.jobs.finished import Finished
 
 COLOURS = {
@@ -184,9 +184,13 @@ def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
     if len(given) > 0:
         rows.append(("also given", ", ".join(given)))
     if (estimate := interpretation.estimate) is not None:
-        needs = f"about {estimate.memory_bytes / 1e9:.1f} GB of memory, {estimate.seconds:,.0f} s on one core"
-        rows.append(("estimate", needs))
+        rows.append(("estimate", needs(estimate)))
     return rows + [("note", note) for note in interpretation.notes]
+
+
+def needs(estimate: Estimate) -> str:
+    """Return estimated memory and time in words."""
+    return f"about {estimate.memory_bytes / 1e9:.1f} GB of memory, {estimate.seconds:,.0f} s on one core"
 
 
 def metrics_table(metrics: Mapping[str, float]) -> Table:

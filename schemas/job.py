@@ -189,7 +189,7 @@ class Interpretation(Record):
     notes: list[str] = Field(default_factory=list, description="Sentences with evidence, exclusions and assumptions.")
     estimate: Estimate | None = Field(
         None,
-        description="Memory and time the job will need; null for films, whose points are not known before they are tracked.",
+        description="Memory and time of the reconstruction; null for films that are not tracked yet, whose points are unknown.",
     )
 
 

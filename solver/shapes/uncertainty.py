@@ -44,9 +44,9 @@ MAX_PATTERNS = 1000
 """Maximum number of patterns evaluated; most sequences have fewer points, and all of them are exact."""
 
 SIMILAR_PATTERNS = 3
-"""Number of evaluated patterns from which the variances of another point are predicted. With 46 of 754 points evaluated, the RMS difference of
-the logarithm from the exact standard deviation is .19 where an object hides itself (.20 with one pattern), and .37 where tracks begin and
-end anywhere (.50)."""
+"""Number of evaluated patterns from which the variances of another point are predicted. With 46 of 754 points evaluated, the RMS
+difference of the logarithm from the exact standard deviation is .19 where an object hides itself (.20 with one pattern), and .37 where
+tracks begin and end anywhere (.50)."""
 
 PATTERNS_AT_ONCE = 4096
 """Points compared with the evaluated patterns at once; bounds the memory at 4 million distances."""
@@ -229,7 +229,7 @@ def _sample(weights: Floats, seed: int) -> NDArray[np.intp]:
 def _predicted(everything: Floats, weights: Floats, sample: NDArray[np.intp], exact: Floats) -> Floats:
     """Return variances `(F, P)`: exact ones for the sample, elsewhere `everything` times the ratios of similar patterns.
 
-    The mean of the logarithms is weighted by the inverse squared distance between patterns (Shepard 1968), so an equal pattern has all weight.
+    The mean of the logarithms is weighted by the inverse squared distance between patterns (Shepard 1968): an equal pattern has all weight.
     """
     rounding, known = np.finfo(float), weights[:, sample]
     ratio = np.log(exact / np.maximum(everything[:, sample], np.maximum(rounding.eps * exact, rounding.tiny)))

@@ -99,6 +99,7 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
         "rate 15 frames per second",
         "rotation 90°, applied",
         "tracking about",
+        "reconstruction about",
     ):
         assert each in words
     assert facts["warnings"] == []

@@ -30,7 +30,7 @@ from pliant.tracking import open_film
 from pliant.tracking.advice import warnings_before
 from pliant.tracking.contact_sheet import small_jpeg
 from pliant.tracking.survey import Survey
-from pliant.worker.errors import Interrupted, TimedOut
+from pliant.worker.errors import Interrupted, InvalidRequest, TimedOut
 from pliant.worker.execution.film import reconstruct_film, solving_seconds
 from pliant.worker.execution.pace import MachinePace
 from pliant.worker.films import frame_strip, tracker
@@ -49,6 +49,7 @@ from pliant.worker.films.tracker import (
     track_film,
 )
 from pliant.worker.formats import Inputs
+from pliant.worker.formats.cost import LIBRARIES, estimated
 from pliant.worker.processes.contained import MAX_ANSWER, MAX_LINE, Ended, _Progress
 from pliant.worker.processes.no_network import forbid_network
 from pliant.worker.settings import Settings
@@ -303,6 +304,7 @@ def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Pa
         assert tracks["tracks"][tracks["template"], :, 0].min() >= 20  # inside the region
     assert done.interpretation is not None
     assert done.interpretation.num_points == shapes_count(tmp_path / "out")
+    assert done.interpretation.estimate == estimated(10, done.interpretation.num_points, done.options or options)
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["seconds"]["track"] > 0
     assert {name: each["sha256"] for name, each in report["artifacts"].items()} == {
@@ -314,6 +316,21 @@ def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Pa
         assert sheet.format == "JPEG"
     check_followed(steps, tmp_path / "out")
     check_film_frames(tmp_path / "out", count=10)
+
+
+def test_a_film_with_too_many_points_for_the_memory_is_refused_before_it_is_solved(
+    film: Path, region: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "scratch").mkdir()
+    steps: list[Progress] = []
+    with pytest.raises(InvalidRequest, match="for 10 frames") as refused:
+        reconstruct_film(
+            FilmSource(film, region), Options(), tmp_path / "out", scratch=tmp_path / "scratch",
+            memory=LIBRARIES + 1000, on_progress=steps.append,
+        )  # fmt: skip
+    assert (refused.value.code, refused.value.field) == ("needs_more_memory", "film")
+    assert {each.stage for each in steps} == {"track"}
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_time_estimate_uses_the_measured_machine_pace(

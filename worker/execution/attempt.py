@@ -280,6 +280,7 @@ def _reconstruct(
     from pliant.worker.films.bounds import FilmBounds
     from pliant.worker.films.sources import is_source, open_source
     from pliant.worker.formats import load_inputs
+    from pliant.worker.processes.memory import memory_for_a_job
 
     options = stored.job.options
     if not is_source(inputs):
@@ -293,7 +294,7 @@ def _reconstruct(
     scratch.mkdir()
     return reconstruct_film(
         source, options, results, scratch=scratch, name=stored.job.name, threads=settings.threads_per_job, bounds=FilmBounds.of(settings),
-        on_progress=attempt.report, should_stop=attempt.should_stop,
+        memory=memory_for_a_job(settings), on_progress=attempt.report, should_stop=attempt.should_stop,
     )  # fmt: skip
 
 

@@ -23,6 +23,7 @@ from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.sources import FilmSource
 from pliant.worker.films.tracker import OnWarnings, track_film
 from pliant.worker.formats.solver_settings import solver_settings
+from pliant.worker.jobs.admission import check_fits
 from pliant.worker.jobs.finished import Finished
 
 FILES = {
@@ -45,6 +46,7 @@ def reconstruct_film(
     name: str = "",
     threads: int = 1,
     bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
+    memory: int = 0,
     on_progress: Callable[[Progress], None] | None = None,
     on_warnings: OnWarnings | None = None,
     should_stop: Callable[[], bool] | None = None,
@@ -52,6 +54,7 @@ def reconstruct_film(
     """Track the film, solve, evaluate and write the files. Raises the same errors as `pipeline.reconstruct`.
 
     The first stage is `track`. `scratch` is an empty folder for the film process; `threads` is the thread count of optical flow.
+    `memory` is the number of bytes available to the job, 0 if unknown: a film with too many points for it is refused once it is tracked.
     `on_warnings` is that of `track_film`.
     """
     kinds_for(options)
@@ -77,6 +80,7 @@ def reconstruct_film(
         if not source.own_rate:
             options = options.model_copy(update={"fps": tracked.fps})
         inputs = read_tracked(scratch / "tracks.npz", tracked, options)
+        check_fits(inputs.interpretation, options, [memory], field="film")
         spent = {"track": time.perf_counter() - began}
         directory.mkdir(parents=True, exist_ok=True)
         artifacts = [_moved(scratch / name, directory) for name in FILES if (scratch / name).exists()]

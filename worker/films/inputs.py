@@ -9,6 +9,7 @@ from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import Mesh, Tracks
 from pliant.worker.films.tracker import Tracked
+from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.errors import damaged
 from pliant.worker.formats.reading.arrays import read_file
 from pliant.worker.formats.records import Inputs, Limits, Selection
@@ -52,6 +53,7 @@ def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
         hidden_fraction=hidden, mesh_source="film", has_ground_truth=False, has_rotations=False, layout="tracks (F, P, 2)",
         format=f"film ({tracked.container})", image_size=options.image_size, fps=tracked.fps, given_points=given,
         num_left_out=len(left_out), left_out_points=left_out[:1000].tolist(),
+        estimate=estimated(checked.num_frames, checked.num_points, options),
         notes=[*notes_on_options(options, film=True), *notes, *how, *sparse, *tracked.warnings],
     )  # fmt: skip
     frames = np.arange(checked.num_frames)

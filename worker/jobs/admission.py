@@ -10,10 +10,12 @@ from pliant.worker.errors import InvalidRequest
 from pliant.worker.formats.cost import largest_that_fits
 
 
-def check_fits(interpretation: Interpretation, options: Options, memories: Iterable[int]) -> None:
+def check_fits(
+    interpretation: Interpretation, options: Options, memories: Iterable[int], *, field: str = "tracks"
+) -> None:
     """Check that at least one worker has the estimated memory of a job.
 
-    `memories` are the bytes available to a job on each running worker; if none is known, every job passes.
+    `memories` are the bytes available to a job on each running worker; if none is known, every job passes. `field` names the input.
 
     Raises
     ------
@@ -29,7 +31,7 @@ def check_fits(interpretation: Interpretation, options: Options, memories: Itera
     ways += [f"at most {fewer} frames (option frames)"] if fewer >= 3 else []
     hint = f"{' or '.join(ways)} would fit." if ways else "Ask the operator for a worker with more memory."
     raise InvalidRequest(
-        "needs_more_memory", field="tracks",
+        "needs_more_memory", field=field,
         expected=f"at most {_gigabytes(largest)}, the memory of the largest worker",
         got=f"about {_gigabytes(estimate.memory_bytes)} for {frames} frames × {count} points",
         hint=hint,

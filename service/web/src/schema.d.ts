@@ -287,7 +287,7 @@ export interface components {
              * @description Sentences with evidence, exclusions and assumptions.
              */
             notes: string[];
-            /** @description Memory and time the job will need; null for films, whose points are not known before they are tracked. */
+            /** @description Memory and time of the reconstruction; null for films that are not tracked yet, whose points are unknown. */
             estimate: components["schemas"]["Estimate"] | null;
             /**
              * Sample
@@ -407,7 +407,7 @@ export interface components {
              * @description Sentences with evidence, exclusions and assumptions.
              */
             notes: string[];
-            /** @description Memory and time the job will need; null for films, whose points are not known before they are tracked. */
+            /** @description Memory and time of the reconstruction; null for films that are not tracked yet, whose points are unknown. */
             estimate: components["schemas"]["Estimate"] | null;
         };
         /**
