@@ -137,8 +137,9 @@ def _finished(
     covariance = start.covariance if problem.weights.temporal > 0 else None
     solution = assessed(
         solution, tracks, confidence, estimate, covariance, normalized.unit,
-        turning=observations.turning, seed=start.settings.seed, connected=start.part is not None or problem.weights.spatial > 0,
-        changes=changes, centred=problem.moving, should_stop=monitor,
+        turning=observations.turning, free_scales=observations.known is None or observations.known.scales is None,
+        seed=start.settings.seed, connected=start.part is not None or problem.weights.spatial > 0, changes=changes,
+        centred=problem.moving, should_stop=monitor,
     )  # fmt: skip
     return replace(solution, outcome=Outcome.STOPPED) if monitor.stopped else solution
 
