@@ -27,8 +27,8 @@ cameras. With it, intervals of ± 4.3 standard deviations contain 92 % of the po
 
 SIZE_CORRELATION = 0.3
 """Standard deviation, relative to the deformation, of the part of it by which the object grows and shrinks. Estimated scales absorb this
-part, because images cannot tell it from a change of the camera's distance. On ten sequences with estimated scales, the standard deviation of
-the error of log s was .09 to .5 of the deformation, on spheres 1.2; the swelling of a balloon is attributed to the scales altogether."""
+part, because images cannot tell it from a change of the camera's distance. On ten sequences with estimated scales, the error of log s was
+.09 to .5 of the deformation, on spheres 1.2; the swelling of a balloon is attributed to the scales altogether."""
 
 
 def assessed(
@@ -113,8 +113,8 @@ def assessed(
 def with_size_std(std: Floats, shapes: Floats, *, centred: bool) -> None:
     """Add the uncertainty of each frame's size to the standard deviations `(F, P)` of shapes `(F, P, 3)`, in place.
 
-    The deformation is the RMS distance of the points from their mean positions, relative to the size of the mean shape (`SIZE_CORRELATION`);
-    `centred` as for `assessed`.
+    The deformation is the RMS distance of the points from their mean positions, relative to the size of the mean shape; `centred` as for
+    `assessed`.
     """
     mean, total = np.zeros(shapes.shape[1:]), 0.0
     for frame in shapes:  # one at a time, to limit memory
