@@ -27,6 +27,7 @@ from pliant.solver import (
     solve_shapes,
 )
 from pliant.solver.evaluation import metrics
+from pliant.solver.shapes import uncertainty
 
 MADE = gallery.face(8, 40, degrees=60, mesh="triangles")
 KNOWN = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
@@ -194,6 +195,7 @@ def test_every_random_generator_uses_the_seed_of_the_settings(monkeypatch: pytes
     many = gallery.face(4, 300, degrees=60)
     visible = original(0).random(many.tracks.visible.shape) > 0.2
     monkeypatch.setattr(np.random, "default_rng", seeded)
+    monkeypatch.setattr(uncertainty, "MAX_PATTERNS", 100)
     settings = Settings(seed=7, max_reweightings=2)
     solve(few, cameras=KNOWN, settings=settings)
     solve(
