@@ -102,15 +102,16 @@ def warnings_of_check(facts: FilmFacts, region: Path | None, options: Options) -
 
 def film_rows(facts: FilmFacts, options: Options) -> list[tuple[str, str]]:
     """Return a film's properties, and what tracking and reconstruction will need, as pairs of label and text."""
-    from pliant.worker.films.tracker import film_options
+    from pliant.worker.films.tracker import film_options, notes_on_rate
     from pliant.worker.formats.cost import estimated
 
     of_all = f" of {facts.stated_frames}" if facts.frames != facts.stated_frames else ""
+    assumed = ", assumed: pictures state none" if notes_on_rate(facts.container) else ""
     rows = [
         ("film", facts.container),
         ("size", f"{facts.width}×{facts.height} pixels"),
         ("frames", f"{facts.frames}{of_all}" if facts.frames else "not stated"),
-        ("rate", f"{facts.fps:.4g} frames per second"),
+        ("rate", f"{facts.fps:.4g} frames per second{assumed}"),
         ("duration", f"{facts.seconds:.1f} s" if facts.seconds else "not stated"),
         ("rotation", f"{facts.rotation}°, applied" if facts.rotation else "none"),
     ]

@@ -199,10 +199,16 @@ class KnownCamera:
             Wrong type or shape, not finite, rows not orthonormal and right-handed to within 1e-3, or a scale or focal length that is not
             positive.
         """
-        if focal is not None and not (np.isfinite(focal) and focal > 0):
-            raise wrong_input(
-                "cameras.focal", "out_of_range", "a positive, finite length", str(focal), "Give it in the tracks' unit."
-            )
+        if focal is not None:
+            length = numeric(focal, "cameras.focal", "Give one length in the tracks' unit.").astype(np.float64)
+            if length.shape != () or not (np.isfinite(length) and length > 0):
+                raise wrong_input(
+                    "cameras.focal",
+                    "out_of_range",
+                    "a positive, finite length",
+                    str(focal),
+                    "Give it in the tracks' unit.",
+                )
         if principal_point is not None:
             point = np.asarray(numeric(principal_point, "cameras.principal_point", "Give x and y."), dtype=np.float64)
             if point.shape != (2,) or not np.isfinite(point).all():

@@ -12,12 +12,13 @@ the deformation is isotropic, and H and λ3 are not used.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 from math import radians, tan
 from numbers import Integral, Real
 from typing import Literal
 
+import numpy as np
 from pliant.solver.errors import InvalidSettings
 
 Method = Literal["pseudo_inverse", "temporal", "spatio_temporal", "robust"]
@@ -183,7 +184,8 @@ class Settings:
     def _check_types(self) -> None:
         for name in ("basis_size", "temporal_order", "max_reweightings", "seed"):
             value = getattr(self, name)
-            if not (isinstance(value, Integral) or (value is None and name in ("basis_size", "temporal_order"))):
+            whole = isinstance(value, Integral) and not isinstance(value, bool)
+            if not (whole or (value is None and name in ("basis_size", "temporal_order"))):
                 raise _out_of_range(name, "a whole number", value)
         for name in (
             "temporal_weight",
@@ -200,11 +202,12 @@ class Settings:
         for name in ("image_size", "principal_point"):
             value = getattr(self, name)
             if value is not None and not (
-                isinstance(value, Iterable) and all(isinstance(each, Real) for each in value)
+                isinstance(value, Collection) and all(isinstance(each, Real) for each in value)
             ):
                 raise _out_of_range(name, "two numbers, or None", value)
-        if self.y_up not in (True, False):
-            raise _out_of_range("y_up", "True or False", self.y_up)
+        for name in ("refine_rotations", "y_up"):
+            if not isinstance(getattr(self, name), (bool, np.bool_)):
+                raise _out_of_range(name, "True or False", getattr(self, name))
 
 
 MAX_CENTRE_DISTANCE = 10.0

@@ -100,6 +100,19 @@ def test_a_film_has_its_own_size_and_no_use_for_options_of_tracks(film: Path) ->
     assert notes[1:] == ["Not used for films: layout, y_axis."]
 
 
+def test_the_rate_of_pictures_is_said_to_be_assumed(tmp_path: Path) -> None:
+    textured = films.textured_pictures(3, SIZE)
+    pictures = films.zip_of(
+        tmp_path / "pictures.zip", {f"{place}.png": films.png(each) for place, each in enumerate(textured)}
+    )
+    facts = check_film(FilmSource(pictures), Options())
+    sentence = "Pictures state no frame rate: unless the option fps is given, 30 frames per second are assumed."
+    assert facts.fps == 30
+    assert sentence in described(facts, film_options(Options(), facts)).notes
+    film = films.write_film(tmp_path / "film.mp4", films.textured_pictures(6, SIZE))
+    assert sentence not in described(check_film(FilmSource(film), Options()), Options()).notes
+
+
 def test_the_first_frame_of_the_whole_film_is_returned_on_request(film: Path, tmp_path: Path) -> None:
     assert check_film(FilmSource(film), Options()).first_frame == ""
     for frames in ("", "4:10"):

@@ -190,6 +190,11 @@ class TestKnownCamera:
         error = refusal(KnownCamera.from_arrays, np.tile(np.eye(3), (4, 1, 1)), principal_point=("a", "b"))
         assert (error.field, error.code) == ("cameras.principal_point", "wrong_type")
 
+    @pytest.mark.parametrize("focal", ["12", 0.0, -5.0, float("nan"), [900.0]], ids=str)
+    def test_focal_length_must_be_a_positive_number(self, focal: Any) -> None:
+        error = refusal(KnownCamera.from_arrays, np.tile(np.eye(3), (4, 1, 1)), focal=focal)
+        assert (error.code, error.field) == ("wrong_type" if focal == "12" else "out_of_range", "cameras.focal")
+
 
 class TestSettings:
     @pytest.mark.parametrize(
@@ -222,6 +227,11 @@ class TestSettings:
             {"image_size": "ab"},
             {"principal_point": 5},
             {"y_up": "no"},
+            {"y_up": np.array([True, False])},
+            {"refine_rotations": "no"},
+            {"refine_rotations": 1},
+            {"max_reweightings": True},
+            {"principal_point": iter((5.0, 5.0))},
             {"surface": "isometric", "camera": "orthographic"},
             {"surface": "isometric", "camera": "scaled_orthographic"},
         ],

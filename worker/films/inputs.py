@@ -8,7 +8,7 @@ import numpy as np
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import Mesh, Tracks
-from pliant.worker.films.tracker import Tracked
+from pliant.worker.films.tracker import Tracked, notes_on_rate
 from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.errors import damaged
 from pliant.worker.formats.reading.arrays import read_file
@@ -54,7 +54,7 @@ def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
         format=f"film ({tracked.container})", image_size=options.image_size, fps=tracked.fps, given_points=given,
         num_left_out=len(left_out), left_out_points=left_out[:1000].tolist(),
         estimate=estimated(checked.num_frames, checked.num_points, options),
-        notes=[*notes_on_options(options, film=True), *notes, *how, *sparse, *tracked.warnings],
+        notes=[*notes_on_options(options, film=True), *notes_on_rate(tracked.container), *notes, *how, *sparse, *tracked.warnings],
     )  # fmt: skip
     frames = np.arange(checked.num_frames)
     selection = Selection(frames, kept, (len(frames), given))

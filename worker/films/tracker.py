@@ -176,6 +176,13 @@ def _followed(stated: object) -> FollowedPoints | None:
         return None
 
 
+def notes_on_rate(container: str) -> list[str]:
+    """Return a note if the film is a zip or folder of pictures, which state no frame rate."""
+    if container not in ("zip", "folder"):
+        return []
+    return ["Pictures state no frame rate: unless the option fps is given, 30 frames per second are assumed."]
+
+
 def described(facts: FilmFacts, options: Options) -> Interpretation:
     """Return the interpretation of a film before it is tracked."""
     of_all = f" of {facts.stated_frames}" if facts.frames and facts.frames != facts.stated_frames else ""
@@ -185,7 +192,8 @@ def described(facts: FilmFacts, options: Options) -> Interpretation:
         has_ground_truth=False, has_rotations=False, layout="tracks (F, P, 2)", format=f"film ({facts.container})",
         given_frames=facts.stated_frames or None, image_size=f"{facts.width}x{facts.height}", fps=facts.fps,
         notes=[f"A film of {facts.width}×{facts.height} pixels, {count}, {options.fps:.3g} frames per second. "
-               "Its points are tracked when the job runs.", *notes_on_options(options, film=True)],
+               "Its points are tracked when the job runs.", *notes_on_rate(facts.container),
+               *notes_on_options(options, film=True)],
     )  # fmt: skip
 
 
