@@ -22,7 +22,7 @@ from pliant.solver.tracks.frame_selection import informative_frames
 
 INFLATION = 1.4
 """Factor applied to the standard deviation from posterior and jackknife, for errors that both omit: model errors and other optima of the
-cameras. With it, intervals of ± 4.3 standard deviations contain 92 % of the positions of the calibration sequences of
+cameras. With it, intervals of ± 4.3 standard deviations contain 91 % of the positions of the calibration sequences of
 `benchmarks.trust`."""
 
 SIZE_CORRELATION = 0.3
