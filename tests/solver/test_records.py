@@ -231,7 +231,7 @@ class TestSettings:
             {"refine_rotations": "no"},
             {"refine_rotations": 1},
             {"max_reweightings": True},
-            {"principal_point": iter((5.0, 5.0))},
+            pytest.param({"principal_point": iter((5.0, 5.0))}, id="an iterator of two numbers"),
             {"surface": "isometric", "camera": "orthographic"},
             {"surface": "isometric", "camera": "scaled_orthographic"},
         ],
