@@ -15,6 +15,7 @@ from pliant.cli.session import LINE_EVERY
 from pliant.cli.show import err, needs, out, show_warnings
 
 if TYPE_CHECKING:
+    from pliant.schemas.job import Estimate
     from pliant.schemas.options import Options
     from pliant.worker.films.tracker import FilmFacts
     from pliant.worker.jobs.finished import Finished
@@ -79,15 +80,16 @@ def inspect_film(film: Path, *, region: Path | None, options: dict[str, Any], as
 
     checked = checked_options(options)
     facts = check_film(FilmSource(film, region), checked, estimate=True, threads=usable_cores())
-    warnings = warnings_of_check(facts, region, checked)
+    warnings, estimate = warnings_of_check(facts, region, checked), solving_estimate(facts, checked)
     if as_json:
-        print_json(facts.model_dump(mode="json") | {"warnings": warnings})
+        needed = None if estimate is None else estimate.model_dump(mode="json")
+        print_json(facts.model_dump(mode="json") | {"estimate": needed, "warnings": warnings})
         return
     from rich.table import Table
     from rich.text import Text
 
     table = Table.grid(padding=(0, 2))
-    for name, words in film_rows(facts, checked):
+    for name, words in film_rows(facts, checked, estimate):
         table.add_row(Text(name, "dim"), Text(words))
     out().print(table)
     show_warnings(warnings)
@@ -100,13 +102,27 @@ def warnings_of_check(facts: FilmFacts, region: Path | None, options: Options) -
     return warnings_unread(whole=region is None and options.region_polygon is None, frames=facts.frames)
 
 
-def film_rows(facts: FilmFacts, options: Options) -> list[tuple[str, str]]:
-    """Return a film's properties, and what tracking and reconstruction will need, as pairs of label and text."""
-    from pliant.worker.films.tracker import film_options, notes_on_rate
+def solving_estimate(facts: FilmFacts, options: Options) -> Estimate | None:
+    """Return the estimated memory and time of the reconstruction; None where the number of frames or points is unknown."""
+    from pliant.worker.films.tracker import film_options
     from pliant.worker.formats.cost import estimated
 
+    if not (facts.points and facts.frames):
+        return None
+    points = min(facts.points, options.max_points or facts.points)
+    return estimated(facts.frames, points, film_options(options, facts))
+
+
+def film_rows(facts: FilmFacts, options: Options, estimate: Estimate | None) -> list[tuple[str, str]]:
+    """Return a film's properties, and what tracking and reconstruction will need, as pairs of label and text."""
+    from pliant.worker.films.tracker import notes_on_rate
+
     of_all = f" of {facts.stated_frames}" if facts.frames != facts.stated_frames else ""
-    assumed = ", assumed: pictures state none" if notes_on_rate(facts.container) else ""
+    assumed = (
+        ", assumed: pictures state none"
+        if notes_on_rate(facts.container) and "fps" not in options.model_fields_set
+        else ""
+    )
     rows = [
         ("film", facts.container),
         ("size", f"{facts.width}×{facts.height} pixels"),
@@ -122,19 +138,8 @@ def film_rows(facts: FilmFacts, options: Options) -> list[tuple[str, str]]:
     rows.append(("points", f"about {facts.points}" if facts.points else "none: no texture in the region"))
     if facts.track_seconds:
         rows.append(("tracking", f"about {facts.track_seconds:.0f} s on this machine"))
-    if facts.points and facts.frames:
-        rows.append(
-            (
-                "reconstruction",
-                needs(
-                    estimated(
-                        facts.frames,
-                        min(facts.points, options.max_points or facts.points),
-                        film_options(options, facts),
-                    )
-                ),
-            )
-        )
+    if estimate is not None:
+        rows.append(("reconstruction", needs(estimate)))
     return rows
 
 

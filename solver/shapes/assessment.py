@@ -27,8 +27,9 @@ cameras. With it, intervals of ± 4.3 standard deviations contain 91 % of the po
 
 SIZE_CORRELATION = 0.3
 """Standard deviation, relative to the deformation, of the part of it by which the object grows and shrinks. Estimated scales absorb this
-part, because images cannot tell it from a change of the camera's distance. On ten sequences with estimated scales, the error of log s was
-.09 to .5 of the deformation, on spheres 1.2; the swelling of a balloon is attributed to the scales altogether."""
+part, because images cannot tell it from a change of the camera's distance. In eleven solves of faces, flags, an arm and a head, with
+perspective and without, the error of log s was .09 to .53 of the deformation; on spheres .8 to 1.2, and on a balloon, whose swelling is
+attributed to the scales altogether, 5."""
 
 
 def assessed(

@@ -230,9 +230,11 @@ def _predicted(everything: Floats, weights: Floats, sample: NDArray[np.intp], ex
     """Return variances `(F, P)`: exact ones for the sample, elsewhere `everything` times the ratios of similar patterns.
 
     The mean of the logarithms is weighted by the inverse squared distance between patterns (Shepard 1968): an equal pattern has all weight.
+    Fewer observations never lower a variance, so a ratio below 1 is rounding.
     """
     rounding, known = np.finfo(float), weights[:, sample]
-    ratio = np.log(exact / np.maximum(everything[:, sample], np.maximum(rounding.eps * exact, rounding.tiny)))
+    least = np.maximum(everything[:, sample], np.maximum(rounding.eps * exact, rounding.tiny))
+    ratio = np.log(np.maximum(exact / least, 1.0))
     found, squares, count = everything.copy(), np.square(known).sum(axis=0), min(SIMILAR_PATTERNS, len(sample))
     others = np.setdiff1d(np.arange(weights.shape[1]), sample)
     for start in range(0, len(others), PATTERNS_AT_ONCE):

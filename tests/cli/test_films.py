@@ -90,6 +90,8 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
     assert (facts["width"], facts["height"], facts["frames"], facts["fps"], facts["rotation"]) == (96, 72, 10, 30.0, 0)
     assert facts["seconds"] == pytest.approx(1 / 3)
     assert 0 < facts["track_seconds"] < 60
+    assert 1e8 < facts["estimate"]["memory_bytes"] < 1e9
+    assert facts["estimate"]["seconds"] > 0
     everything = json.loads(inspect(film, "--json").stdout)
     assert 0 < facts["points"] < 0.5 * everything["points"]
     words = " ".join(inspect(films.turned_by_90(copied(film, tmp_path)), "-O", "frames=::2").output.split())

@@ -342,6 +342,7 @@ def test_a_film_with_too_many_points_for_the_memory_is_refused_before_it_is_solv
             memory=LIBRARIES + 1000, on_progress=steps.append,
         )  # fmt: skip
     assert (refused.value.code, refused.value.field) == ("needs_more_memory", "film")
+    assert refused.value.expected.endswith("the memory of this worker")
     assert {each.stage for each in steps} == {"track"}
     assert not (tmp_path / "out").exists()
 

@@ -80,7 +80,7 @@ def reconstruct_film(
         if not source.own_rate:
             options = options.model_copy(update={"fps": tracked.fps})
         inputs = read_tracked(scratch / "tracks.npz", tracked, options)
-        check_fits(inputs.interpretation, options, [memory], field="film")
+        check_fits(inputs.interpretation, options, [memory], film=True)
         spent = {"track": time.perf_counter() - began}
         directory.mkdir(parents=True, exist_ok=True)
         artifacts = [_moved(scratch / name, directory) for name in FILES if (scratch / name).exists()]

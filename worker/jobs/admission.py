@@ -11,11 +11,12 @@ from pliant.worker.formats.cost import largest_that_fits
 
 
 def check_fits(
-    interpretation: Interpretation, options: Options, memories: Iterable[int], *, field: str = "tracks"
+    interpretation: Interpretation, options: Options, memories: Iterable[int], *, film: bool = False
 ) -> None:
     """Check that at least one worker has the estimated memory of a job.
 
-    `memories` are the bytes available to a job on each running worker; if none is known, every job passes. `field` names the input.
+    `memories` are the bytes available to a job on each running worker; if none is known, every job passes. `film` is true for a
+    tracked film, of which only the worker that tracked it is considered.
 
     Raises
     ------
@@ -30,9 +31,11 @@ def check_fits(
     ways = [f"max_points={points}"] if points >= 4 else []
     ways += [f"at most {fewer} frames (option frames)"] if fewer >= 3 else []
     hint = f"{' or '.join(ways)} would fit." if ways else "Ask the operator for a worker with more memory."
+    if film and ways:
+        hint += " A retry may run on a larger worker."
     raise InvalidRequest(
-        "needs_more_memory", field=field,
-        expected=f"at most {_gigabytes(largest)}, the memory of the largest worker",
+        "needs_more_memory", field="film" if film else "tracks",
+        expected=f"at most {_gigabytes(largest)}, the memory of {'this' if film else 'the largest'} worker",
         got=f"about {_gigabytes(estimate.memory_bytes)} for {frames} frames × {count} points",
         hint=hint,
     )  # fmt: skip

@@ -169,6 +169,17 @@ def test_points_with_short_tracks_get_the_std_of_similar_tracks(
     assert abs(off[shown].mean()) < 0.05
 
 
+def test_variances_that_vanish_by_rounding_predict_finite_ones() -> None:
+    weights = np.triu(np.ones((5, 5)))
+    everything = np.full((5, 5), 1e-18)
+    everything[:, 2:] = 0.0
+    exact = np.array([[1e-18, -1e-19], [0.0, 2e-18], [1e-17, 1.0], [-1e-30, 0.0], [3e-18, 1e-18]])
+    found = uncertainty._predicted(everything, weights, np.array([0, 1]), exact)
+    assert np.isfinite(found).all()
+    np.testing.assert_array_equal(found[:, :2], exact)
+    assert (found[:, 2:] >= 0).all()
+
+
 def test_points_visible_in_all_frames_or_in_none_have_the_exact_std_beside_rarely_visible_ones(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
