@@ -309,3 +309,19 @@ class Options(Chosen):
         description="For a film: corners [x, y] of the region to track, in the film's pixels, y down, instead of a mask picture; "
         "null: the mask, or the entire picture.",
     )
+
+    @property
+    def picture_size(self) -> tuple[int, int] | None:
+        """Width and height in `image_size`, pixels; None without it."""
+        if self.image_size is None:
+            return None
+        width, height = self.image_size.split("x")
+        return int(width), int(height)
+
+    @property
+    def principal_point_xy(self) -> tuple[float, float] | None:
+        """Coordinates in `principal_point`, pixels; None without it."""
+        if self.principal_point is None:
+            return None
+        x, y = self.principal_point.split(",")
+        return float(x), float(y)

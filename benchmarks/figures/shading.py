@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from pliant.tracking.rendering.rasterising import rasterise, triangulate
+from pliant.solver.mesh import triangles_of
+from pliant.tracking.rendering.rasterising import rasterise
 
 LIGHTS = (((-0.55, -0.65, -0.60), 0.52), ((0.80, -0.05, -0.60), 0.20), ((0.0, 0.0, -1.0), 0.22))
 """Directions towards the light (x right, y down, z away from the viewer) and strengths: a key, a fill, and one beside the eye."""
@@ -33,7 +34,7 @@ def draw_mesh(
     """
     fine = SUPERSAMPLING
     height, width = size[0] * fine, size[1] * fine
-    triangles = triangulate(faces)
+    triangles = triangles_of(faces)
     normals = _vertex_normals(points, triangles)
     screen = (points[:, :2] - centre) * (scale * fine) + ((width - 1) / 2, (height - 1) / 2)
     # A distance of a million depths makes the rasteriser's perspective negligible.

@@ -28,12 +28,6 @@ class Surface:
     """Distance along the optical axis, shape `(H, W)`; infinity where the mesh covers nothing."""
 
 
-def triangulate(faces: NDArray[np.integer]) -> Ints:
-    """Split quads `(T, 4)` into triangles `(2T, 3)`; triangles pass unchanged."""
-    split = faces if faces.shape[1] == 3 else np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
-    return np.asarray(split, dtype=np.int64)
-
-
 def rasterise(pixels: Floats, depth: Floats, triangles: Ints, *, size: tuple[int, int]) -> Surface:
     """Find the nearest triangle at the centre of every pixel; both sides of a triangle are visible.
 

@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pliant.solver.gallery import Sequence
+from pliant.solver.mesh import triangles_of
 from pliant.tracking.errors import FilmError
-from pliant.tracking.rendering.rasterising import Floats, Ints, Surface, rasterise, triangulate
+from pliant.tracking.rendering.rasterising import Floats, Ints, Surface, rasterise
 
 SUPERSAMPLING = 2
 """Samples per pixel side."""
@@ -278,7 +279,16 @@ def render_film(
     rest = sequence.shapes[0] * (focal / (distance * radius))
     colours = None if paint is None else np.asarray(paint, dtype=np.float64)
     return RenderedFilm(
-        size, focal, shapes, triangulate(sequence.mesh.faces), rest, blur, noise, colours, occluder, seed
+        size,
+        focal,
+        shapes,
+        triangles_of(sequence.mesh.faces).astype(np.int64),
+        rest,
+        blur,
+        noise,
+        colours,
+        occluder,
+        seed,
     )
 
 

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 from typing import IO
 
 import numpy as np
-from pliant.worker.artifacts.geometry import Floats, triangles_of, vertex_normals
+from pliant.solver.mesh import triangles_of
+from pliant.worker.artifacts.geometry import Floats, vertex_normals
 from pliant.worker.artifacts.names import header_line, word
 from pliant.worker.artifacts.result import Result
 

@@ -1,4 +1,4 @@
-"""Geometry shared by writers: triangles, normals, axes, and a suitable scale for viewers."""
+"""Geometry shared by writers: normals, axes, and a suitable scale for viewers."""
 
 from __future__ import annotations
 
@@ -8,13 +8,6 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Ints = NDArray[np.int32]
-
-
-def triangles_of(faces: Ints) -> Ints:
-    """Split quads along the diagonal of their corners 0 and 2; triangles stay as they are."""
-    if faces.shape[1] == 3:
-        return faces
-    return np.stack([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
 
 
 def upright(shapes: Floats, y_axis: str) -> Floats:

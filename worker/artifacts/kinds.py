@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options, Output
 from pliant.solver import InvalidInput
+from pliant.solver.mesh import triangles_of
 from pliant.worker.artifacts import matlab, preview
 from pliant.worker.artifacts.animation import animate
 from pliant.worker.artifacts.colours import linear
 from pliant.worker.artifacts.frames_zip import OnProgress, write_obj_zip, write_ply_zip
-from pliant.worker.artifacts.geometry import Floats, triangles_of, viewer_scale
+from pliant.worker.artifacts.geometry import Floats, viewer_scale
 from pliant.worker.artifacts.glb import write_glb
 from pliant.worker.artifacts.names import object_name
 from pliant.worker.artifacts.result import Result
@@ -111,7 +112,9 @@ def _glb(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
     elif result.texture is None and result.picture_colours is not None:
         colours = _rgba(result.picture_colours)
     scale = viewer_scale(shapes)
-    view = view_of(result.solution.camera, shapes, y_axis=result.y_axis, scale=scale, image_size=result.image_size)
+    view = view_of(
+        result.solution.camera, shapes, y_axis=result.y_axis, scale=scale, image_size=result.options.picture_size
+    )
     on_progress(0.4)
     write_glb(
         file, animation, triangles_of(result.faces), times=result.times, node={"scale": [scale] * 3}, name=object_name(result.name),
@@ -163,7 +166,7 @@ def _preview(result: Result, file: IO[bytes]) -> None:
         y_axis=inputs.interpretation.y_axis,
         fps=result.options.fps,
         uneven_times=result.uneven_times,
-        image_size=result.options.image_size,
+        image_size=result.options.picture_size,
         point_names=inputs.point_names,
         texture=inputs.texture,
     )

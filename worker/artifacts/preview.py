@@ -44,7 +44,7 @@ from pliant.solver import Mesh, Solution, Tracks
 from pliant.solver.evaluation.alignment import align
 from pliant.solver.evaluation.metrics import frame_errors
 from pliant.solver.evaluation.trust import size_of
-from pliant.worker.artifacts.geometry import triangles_of
+from pliant.solver.mesh import triangles_of
 from pliant.worker.formats.texture import Texture
 
 NAME = "preview.bin"
@@ -137,14 +137,14 @@ def write_preview(
     y_axis: str = "down",
     fps: float = 25.0,
     uneven_times: Floats | None = None,
-    image_size: str | None = None,
+    image_size: tuple[int, int] | None = None,
     point_names: Sequence[str] | None = None,
     texture: Texture | None = None,
 ) -> None:
     """Write the file from tracks, solution and, if known, the truth `(F, P, 3)`, in any axes, NaN where unknown.
 
     `y_axis` is the direction of the image's y axis; `fps` is the rate before frames are skipped; `uneven_times` holds the seconds of every
-    frame, `(F,)`, of a film that does not have this rate throughout; `image_size` is WIDTHxHEIGHT, as in the option.
+    frame, `(F,)`, of a film that does not have this rate throughout; `image_size` is width and height in pixels.
     """
     stride = max(1, -(-solution.shapes[..., 0].size // MOST_OBSERVATIONS))
     facing, mirrored = (None, False) if truth is None else _onto(solution.shapes, truth)
@@ -164,7 +164,7 @@ def write_preview(
         "all_frames": len(solution.shapes),
         "focal": solution.camera.focal,
         "principal_point": solution.camera.principal_point.tolist(),
-        "image_size": None if image_size is None else [float(side) for side in image_size.split("x")],
+        "image_size": None if image_size is None else [float(side) for side in image_size],
     }
     sections = [Section.of("faces", faces), *_sections(tracks, solution, truth, facing, kept, rounding)]
     if uneven_times is not None:

@@ -71,8 +71,8 @@ def described_camera(solution: Solution, options: Options) -> dict[str, Any]:
     """
     camera, choices = solution.camera, solution.choices
     angle, angle_std = None, None
-    if camera.focal is not None and options.image_size is not None:
-        half = float(options.image_size.split("x")[0]) / 2
+    if camera.focal is not None and options.picture_size is not None:
+        half = options.picture_size[0] / 2
         angle = math.degrees(2 * math.atan2(half, camera.focal))
         if camera.focal_std is not None:
             angle_std = math.degrees(2 * half / (camera.focal**2 + half**2)) * camera.focal_std

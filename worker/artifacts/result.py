@@ -33,14 +33,6 @@ class Result:
         """Direction of the tracks' y axis: `down` or `up`."""
         return self.inputs.interpretation.y_axis
 
-    @property
-    def image_size(self) -> tuple[float, float] | None:
-        """Width and height of the picture, pixels; None if the options do not give them."""
-        if self.options.image_size is None:
-            return None
-        width, height = self.options.image_size.split("x")
-        return float(width), float(height)
-
     @cached_property
     def uneven_times(self) -> Floats | None:
         """Seconds of every frame of a film from the first, `(F,)`; None if its frames follow each other at the option `fps`.

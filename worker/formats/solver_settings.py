@@ -15,14 +15,6 @@ def solver_settings(options: Options, *, y_up: bool = False) -> Settings:
         Two options contradict each other.
     """
     values = {name: getattr(options, name) for name in SOLVER_FIELDS}
-    values["image_size"] = _pair(options.image_size, "x")
-    values["principal_point"] = _pair(options.principal_point, ",")
+    values["image_size"] = options.picture_size
+    values["principal_point"] = options.principal_point_xy
     return Settings(**values, y_up=y_up)
-
-
-def _pair(text: str | None, between: str) -> tuple[float, float] | None:
-    """Parse two numbers joined by a separator."""
-    if text is None:
-        return None
-    first, second = text.split(between)
-    return float(first), float(second)

@@ -18,9 +18,10 @@ import trimesh
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.solver.evaluation.metrics import evaluate, point_errors
+from pliant.solver.mesh import triangles_of
 from pliant.worker.artifacts import build_report, kinds_for, matlab, write_artifacts
 from pliant.worker.artifacts.colours import STOPS, Painting, linear, shade
-from pliant.worker.artifacts.geometry import triangles_of, upright, vertex_normals, viewer_scale
+from pliant.worker.artifacts.geometry import upright, vertex_normals, viewer_scale
 from pliant.worker.artifacts.scenes import usd
 from pliant.worker.execution import pipeline
 from pliant.worker.formats.records import Selection

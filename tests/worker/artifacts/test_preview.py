@@ -152,7 +152,7 @@ def test_tables_hold_visibility_rejections_and_uncertainty(sequence: Sequence, t
     std = np.random.default_rng(4).uniform(0.1, 2.0, size=(F, P))
     solution = replace(exact, weights=weights, shapes_std=std)
     path = tmp_path / preview.NAME
-    write(path, tracks=sequence.tracks, mesh=None, solution=solution, truth=sequence.shapes, image_size="320x240")
+    write(path, tracks=sequence.tracks, mesh=None, solution=solution, truth=sequence.shapes, image_size=(320, 240))
     header, arrays = read(path)
     assert (header["all_frames"], header["image_size"]) == (F, [320, 240])
     np.testing.assert_array_equal(arrays["points"][:, 0], seen.sum(axis=0))

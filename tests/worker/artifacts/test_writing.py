@@ -14,10 +14,11 @@ import pytest
 import trimesh
 from khronos import assert_valid
 from pliant.solver.evaluation.metrics import point_errors
+from pliant.solver.mesh import triangles_of
 from pliant.worker.artifacts import build_report, write_artifacts
 from pliant.worker.artifacts.animation import animate, leading
 from pliant.worker.artifacts.colours import linear, shade
-from pliant.worker.artifacts.geometry import triangles_of, upright, vertex_normals, viewer_scale
+from pliant.worker.artifacts.geometry import upright, vertex_normals, viewer_scale
 from pliant.worker.artifacts.glb import write_glb
 from pxr import Gf, Usd, UsdGeom
 from results import make_result, moving_sheet, write

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from pliant.solver.mesh import triangles_of
 from pliant.worker.artifacts.colours import linear
-from pliant.worker.artifacts.geometry import triangles_of, vertex_normals, viewer_scale
+from pliant.worker.artifacts.geometry import vertex_normals, viewer_scale
 from pliant.worker.artifacts.names import identifier, object_name
 from pliant.worker.artifacts.result import Result
 from pliant.worker.artifacts.scenes.by_path import path_beside

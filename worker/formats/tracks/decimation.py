@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Mesh
+from pliant.solver.mesh import triangles_of
 from pliant.solver.records import MIN_POINTS
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ def _thin_mesh(
     from scipy.sparse.csgraph import connected_components
 
     places, seen = _places(points, visible)
-    triangles = split_quads(mesh.faces)
+    triangles = triangles_of(mesh.faces)
     graph = edge_lengths(places, seen, mesh.edges)
     used = np.unique(mesh.faces).astype(np.intp)
     parts = np.unique(connected_components(graph, directed=False)[1][used], return_inverse=True)[1]
@@ -189,11 +190,6 @@ def edge_lengths(places: NDArray[np.float64], seen: NDArray[np.bool], edges: NDA
     known = lengths > 0
     lengths[~known] = float(np.median(lengths[known])) if known.any() else 1.0
     return csr_array((lengths, (one, two)), shape=(places.shape[1], places.shape[1]))
-
-
-def split_quads(faces: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Split quads along their first diagonal; triangles stay as they are."""
-    return faces if faces.shape[1] == 3 else np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
 
 
 def _nearest(graph: csr_array, seeds: Indices) -> Indices:

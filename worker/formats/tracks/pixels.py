@@ -45,7 +45,7 @@ def place(points: NDArray[np.generic], options: Options, *, picture: tuple[int, 
     AmbiguousInput
         Code ambiguous_coordinates: values from 0 to 1, which may be fractions of a picture or another unit.
     """
-    size = _size(options.image_size)
+    size = options.picture_size
     sample = _sampled(points)
     points, sample, notes = _ordered(points, sample, options, size)
     kind, why = _kind(sample, options, size or picture)
@@ -101,13 +101,6 @@ def project(
         seen = np.stack([fx * wide[..., 0] / depth + cx, fy * wide[..., 1] / depth + cy], axis=-1)
     note = f"Points in space, projected with fx = {fx:g}, fy = {fy:g}, cx = {cx:g}, cy = {cy:g}; the points are used as ground truth."
     return seen, "projected", [note]
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    width, _, height = text.partition("x")
-    return int(width), int(height)
 
 
 def _sampled(points: NDArray[np.generic]) -> NDArray[np.float64]:
