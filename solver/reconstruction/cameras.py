@@ -174,9 +174,8 @@ def _with_shapes(
         scaled = observations.turning or (known is not None and known.scales is None)
         scaled = scaled and settings.estimates_scales and not (known is None and corrupted_plane)
         estimate, data = refine_cameras(
-            estimate, shown, turning=observations.turning and not corrupted_plane,
-            estimates_scales=scaled, seed=settings.seed, normalized=normalized,
-            y_up=settings.y_up, should_stop=monitor,
+            estimate, normalized, shown, turning=observations.turning and not corrupted_plane, estimates_scales=scaled,
+            seed=settings.seed, y_up=settings.y_up, should_stop=monitor,
         )  # fmt: skip
     elif observations.lens is not None:
         used = np.flatnonzero(shown)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.records import Floats
 from pliant.solver.tracks.frame_selection import of_frames
+from pliant.solver.tracks.normalization import Normalized
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -16,6 +17,9 @@ class Evidence:
     """An estimate, and the completed tracks of the frames used, divided by the starting scales."""
 
     estimate: CameraEstimate
+
+    normalized: Normalized
+    """The uncompleted tracks of all frames."""
 
     used: NDArray[np.intp]
     """Indices of the frames used, shape `(F',)`, increasing."""
@@ -30,15 +34,19 @@ class Evidence:
     """Sampled points, shape `(F', S, 2)`."""
 
     @classmethod
-    def of(cls, estimate: CameraEstimate, used: NDArray[np.intp], start_scales: Floats) -> Evidence:
+    def of(
+        cls, estimate: CameraEstimate, normalized: Normalized, used: NDArray[np.intp], start_scales: Floats
+    ) -> Evidence:
         """Return the tracks of an estimate at the frames used, divided by the starting scales, shape `(F,)`."""
         wide = np.repeat(start_scales, 2)
         gram = of_frames(estimate.gram / np.outer(wide, wide), used)
-        return cls(estimate, used, start_scales, gram, (estimate.sample / start_scales[:, None, None])[used])
+        return cls(
+            estimate, normalized, used, start_scales, gram, (estimate.sample / start_scales[:, None, None])[used]
+        )
 
     def corrected(self, estimate: CameraEstimate) -> Evidence:
         """Return the evidence of an estimate with newly corrected tracks, at the same frames."""
-        return Evidence.of(estimate, self.used, self.start_scales)
+        return Evidence.of(estimate, self.normalized, self.used, self.start_scales)
 
     @property
     def bends(self) -> bool:

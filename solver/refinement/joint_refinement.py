@@ -43,12 +43,12 @@ COUPLED_ROUNDS = 2
 
 def refine_cameras(
     estimate: CameraEstimate,
+    normalized: Normalized,
     shown: NDArray[np.bool_],
     *,
     turning: bool,
     estimates_scales: bool = False,
     seed: int = 0,
-    normalized: Normalized | None = None,
     y_up: bool = False,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[CameraEstimate, LearningData]:
@@ -58,6 +58,8 @@ def refine_cameras(
     ----------
     estimate : CameraEstimate
         Starting cameras, with the Gram matrix and the sample of the completed tracks.
+    normalized : Normalized
+        The uncompleted tracks, from which perspective and hidden entries are estimated.
     shown : array, shape (F,)
         Frames that show enough points to learn from; the others are interpolated.
     turning : bool
@@ -66,30 +68,26 @@ def refine_cameras(
         True frees scales that are all 1 if that gains more likelihood than chance.
     seed : int
         Seed of the split of the points for held-out scores.
-    normalized : Normalized, optional
-        The uncompleted tracks; without them, perspective and hidden entries are ignored.
     y_up : bool
         Whether y points up in the images.
     should_stop : callable, optional
         Called between refinements; once it returns True, the best so far is returned.
     """
-    start = Evidence.of(estimate, np.flatnonzero(shown), np.asarray(estimate.scales))
+    start = Evidence.of(estimate, normalized, np.flatnonzero(shown), np.asarray(estimate.scales))
     enter(should_stop, "model_order")
     model_order = select_model_order(
         start.sample, start.projections, ordered=estimate.ordered, seed=seed, should_stop=should_stop
     )
-    unsettled, start = start, _started(start, normalized, model_order, turning=turning, should_stop=should_stop)
+    unsettled, start = start, _started(start, model_order, turning=turning, should_stop=should_stop)
     estimate = start.estimate
     if not turning:
         if estimates_scales and (start.start_scales == 1).all():
-            start = _with_free_scales(start, unsettled, normalized, model_order, should_stop)
+            start = _with_free_scales(start, unsettled, model_order, should_stop)
             estimate = start.estimate
         projections = start.projections
-        if normalized is not None and estimate.filling is not None:
+        if estimate.filling is not None:
             found = learned_at(start.gram, start.rotations, np.ones(len(start.used)), model_order, should_stop)
-            start, found = _of_observations(
-                start, found, normalized, with_scales=False, turning=False, should_stop=should_stop
-            )
+            start, found = _of_observations(start, found, with_scales=False, turning=False, should_stop=should_stop)
             estimate = start.estimate
         return estimate, LearningData(
             start.gram, start.sample, projections, start.used, model_order, stopped=None,
@@ -99,10 +97,10 @@ def refine_cameras(
     if estimates_scales and (start.start_scales == 1).all():
         enter(should_stop, "scales")
         trial = try_free_scales(start.gram, start.rotations, model_order, should_stop)
-    evidence, found = _refined(start, normalized, trial, model_order, should_stop)
-    if normalized is not None and estimate.filling is not None and np.isfinite(found.energy):
+    evidence, found = _refined(start, trial, model_order, should_stop)
+    if estimate.filling is not None and np.isfinite(found.energy):
         evidence, found = _of_observations(
-            evidence, found, normalized, with_scales=trial is not None and trial.start is not None,
+            evidence, found, with_scales=trial is not None and trial.start is not None,
             turning=True, should_stop=should_stop,
         )  # fmt: skip
         # The order limits the modes of completed tracks; expected moments include the uncertainty of hidden entries. Errors
@@ -120,7 +118,6 @@ def refine_cameras(
 
 def _started(
     start: Evidence,
-    normalized: Normalized | None,
     model_order: ModelOrder,
     *,
     turning: bool,
@@ -131,12 +128,17 @@ def _started(
         enter(should_stop, "starts", units=UNITS_PER_START * (1 + others))
         best = best_start(start.estimate, start.gram, start.used, model_order, should_stop)
         start = replace(start, estimate=best)
-    if start.estimate.perspective is None or normalized is None:
+    if start.estimate.perspective is None:
         return start
     enter(should_stop, "perspective")
     return start.corrected(
         settled(
-            start.estimate, normalized, start.used, model_order=model_order, turning=turning, should_stop=should_stop
+            start.estimate,
+            start.normalized,
+            start.used,
+            model_order=model_order,
+            turning=turning,
+            should_stop=should_stop,
         )
     )
 
@@ -144,7 +146,6 @@ def _started(
 def _with_free_scales(
     settled: Evidence,
     unsettled: Evidence,
-    normalized: Normalized | None,
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None,
 ) -> Evidence:
@@ -158,8 +159,8 @@ def _with_free_scales(
         return replace(settled, estimate=_with_scale_reason(settled.estimate, trial))
     scales = _at_all_frames(settled.used, trial.start, len(settled.start_scales))
     estimate = replace(_with_scale_reason(unsettled.estimate, trial), scales=scales)
-    again = Evidence.of(estimate, settled.used, scales)
-    return _started(again, normalized, model_order, turning=False, should_stop=should_stop)
+    again = Evidence.of(estimate, settled.normalized, settled.used, scales)
+    return _started(again, model_order, turning=False, should_stop=should_stop)
 
 
 def _with_scale_reason(estimate: CameraEstimate, trial: ScaleTrial) -> CameraEstimate:
@@ -176,7 +177,6 @@ def _at_all_frames(used: NDArray[np.intp], scales: Floats, frames: int) -> Float
 
 def _refined(
     evidence: Evidence,
-    normalized: Normalized | None,
     trial: ScaleTrial | None,
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None,
@@ -187,15 +187,15 @@ def _refined(
     enter(should_stop, "refinement", units=REFINEMENT_UNITS[may_couple])
     found = _first_rounds(evidence, trial, model_order, should_stop)
     if bends:
-        evidence, found = _with_settled_depths(evidence, normalized, found, model_order, should_stop)
+        evidence, found = _with_settled_depths(evidence, found, model_order, should_stop)
     if may_couple and full_mode_covariance.is_identifiable(found.covariance, estimate.sample.shape[1]):
         found = _coupled(evidence.gram, found, with_scales=with_scales, should_stop=should_stop)
         if bends:
-            evidence, found = _with_settled_depths(evidence, normalized, found, model_order, should_stop)
+            evidence, found = _with_settled_depths(evidence, found, model_order, should_stop)
     if not np.isfinite(found.energy):
         return evidence, found
     if bends:
-        return _with_probable_focal(evidence, normalized, found)
+        return _with_probable_focal(evidence, found)
     return _with_probable_depth(evidence, found, model_order, should_stop)
 
 
@@ -216,16 +216,14 @@ def _first_rounds(
 
 def _with_settled_depths(
     evidence: Evidence,
-    normalized: Normalized | None,
     found: Learned,
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None,
 ) -> tuple[Evidence, Learned]:
     """Return the tracks, corrected with the depths of `found`, and `found` refined once more."""
-    assert normalized is not None
     used = evidence.used
     estimate, found = settled_again(
-        evidence.estimate, normalized, used, found, evidence.start_scales[used],
+        evidence.estimate, evidence.normalized, used, found, evidence.start_scales[used],
         model_order=model_order, should_stop=should_stop,
     )  # fmt: skip
     return evidence.corrected(estimate), found
@@ -242,7 +240,7 @@ def _with_probable_depth(
     return replace(evidence, estimate=estimate), found
 
 
-def _with_probable_focal(evidence: Evidence, normalized: Normalized | None, found: Learned) -> tuple[Evidence, Learned]:
+def _with_probable_focal(evidence: Evidence, found: Learned) -> tuple[Evidence, Learned]:
     """Return tracks, cameras and covariance at the most probable depth and the focal length that belongs to it.
 
     λ times the depth, seen with λ times the focal length, shows the same perspective. If the tracks or a given focal length determine the
@@ -250,14 +248,13 @@ def _with_probable_focal(evidence: Evidence, normalized: Normalized | None, foun
     """
     view = evidence.estimate.perspective
     assert view is not None
-    assert normalized is not None
     if view.given is not None:
         return evidence, found
     moved, stretch = settled_depth(evidence.gram, found)
     if not is_typical(stretch):
         return evidence, found
     estimate = with_stretched_depth(
-        evidence.estimate, normalized, evidence.used, moved, evidence.start_scales[evidence.used], stretch
+        evidence.estimate, evidence.normalized, evidence.used, moved, evidence.start_scales[evidence.used], stretch
     )
     return evidence.corrected(_with_depth_choice(estimate, stretch)), moved
 
@@ -286,7 +283,6 @@ def _of_all_frames(
 def _of_observations(
     evidence: Evidence,
     found: Learned,
-    normalized: Normalized,
     *,
     with_scales: bool,
     turning: bool,
@@ -298,7 +294,7 @@ def _of_observations(
     translations = np.array(estimate.translations)
     completed = Moments(evidence.gram, evidence.sample, translations[used], estimate.outliers)
     found, moments = on_observations(
-        Observed.of(normalized, estimate, used), found, completed, evidence.start_scales[used],
+        Observed.of(evidence.normalized, estimate, used), found, completed, evidence.start_scales[used],
         with_scales=with_scales, turning=turning, should_stop=should_stop,
     )  # fmt: skip
     translations[used] = moments.translations

@@ -44,8 +44,6 @@ def step(
     problem: Problem,
     state: State,
     *,
-    reduction: float | None = None,
-    max_inner: int = MAX_INNER,
     tolerance: float = 0.0,
     should_stop: Callable[[], bool] | None = None,
 ) -> State:
@@ -54,21 +52,20 @@ def step(
     Conjugate gradients solve for the correction to the shapes. It needs only one or two digits, so single precision is
     enough where `inner_precision` allows it. Gradient, sum and energy keep the problem's precision.
 
-    `reduction` defaults to the share of the last decrease that the quadratic majoriser did not predict (Eisenstat,
-    Walker 1996, choice 1): if the weights hardly change, an accurate solution is worthwhile. The inner solve also ends
-    once its remaining decrease is negligible compared with `tolerance` times the energy.
+    The inner solve ends at the relative residual `state.reduction`, the share of the last decrease that the quadratic
+    majoriser did not predict (Eisenstat, Walker 1996, choice 1): if the weights hardly change, an accurate solution is
+    worthwhile. It also ends once its remaining decrease is negligible compared with `tolerance` times the energy.
     """
-    reduction = state.reduction if reduction is None else reduction
     operator = operator_at(problem, state)
     downhill = _downhill(problem, state, operator)
     tick = should_stop if should_stop is not None else bool
     tick()
-    inner = operator.rounded(inner_precision(operator, reduction))
+    inner = operator.rounded(inner_precision(operator, state.reduction))
     precondition = build_preconditioner(inner)
     downhill = downhill.astype(inner.weights.dtype, copy=False)
     tick()
     solved = conjugate_gradient(
-        inner.apply, downhill, precondition=precondition, reduction=reduction, max_iterations=max_inner,
+        inner.apply, downhill, precondition=precondition, reduction=state.reduction, max_iterations=MAX_INNER,
         negligible=NEGLIGIBLE * tolerance * abs(state.objective), should_stop=should_stop,
     )  # fmt: skip
     del downhill, precondition, inner  # before the next weights are allocated

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from learning import learn
-from pliant.solver import Settings, gallery
+from pliant.solver import Settings, Tracks, gallery
 from pliant.solver.cameras.estimation import (
     MAX_START_DEPTH_VARIANCE,
     CameraEstimate,
@@ -92,7 +92,7 @@ def test_the_start_that_leads_to_the_higher_likelihood_is_chosen(
         tracks,
         **{kind: (OtherCameras(7, other, "other rotations, from K = 7,"),)},
     )
-    found, _ = learn(estimate, np.ones(FRAMES, dtype=bool), turning=True)
+    found, _ = learn(estimate, normalize(Tracks.from_arrays(tracks)), turning=True)
     common = nearest(np.einsum("fij,fik->jk", found.rotations, true))
     assert np.degrees(angles_between(found.rotations @ common, true)).mean() < 0.1
     assert found.basis_size == (7 if better == "rival" else 1)

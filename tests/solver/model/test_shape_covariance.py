@@ -28,6 +28,7 @@ from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
 from pliant.solver.tracks.frame_selection import informative_frames
+from pliant.solver.tracks.normalization import normalize
 
 FRAMES = 14
 
@@ -190,16 +191,16 @@ def test_a_stop_leaves_the_rotations_of_the_start(face: gallery.Sequence) -> Non
         rows @ rows.T / 400,
         rows.reshape(24, 2, -1).transpose(0, 2, 1),
     )
-    shown = np.ones(24, dtype=bool)
+    normalized = normalize(face.tracks)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
             "pliant.solver.refinement.covariance_learning.learn_with_early_stopping", None
         )  # a stop learns nothing more
-        stopped, _ = learn(estimate, shown, turning=True, should_stop=lambda: True)
+        stopped, _ = learn(estimate, normalized, turning=True, should_stop=lambda: True)
     np.testing.assert_allclose(
         stopped.rotations, np.asarray(face.rotations) @ np.asarray(face.rotations)[0].T, atol=1e-12
     )
-    moved, covariance = learn(estimate, shown, turning=True)
+    moved, covariance = learn(estimate, normalized, turning=True)
     assert np.abs(moved.rotations - stopped.rotations).max() > 1e-5
     assert covariance.nll < improve(begin(estimate.gram, projections), estimate.gram, projections, iterations=5).nll
 

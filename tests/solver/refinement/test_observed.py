@@ -107,7 +107,7 @@ def test_cameras_are_refined_on_the_observations_where_entries_are_hidden(turnin
     tracks = gallery.corrupt(MADE, noise=0.01, hidden=0.3, seed=2).tracks
     normalized = normalize(tracks)
     estimate = given_cameras(normalized, KNOWN, Settings())
-    found, data = refine_cameras(estimate, np.ones(20, dtype=bool), turning=turning, normalized=normalized)
+    found, data = refine_cameras(estimate, normalized, np.ones(20, dtype=bool), turning=turning)
     assert np.abs(data.gram - estimate.gram).max() > 1e-5
     assert np.abs(data.sample - estimate.sample)[normalized.visible == 0].max() > 1e-3
     assert np.abs(np.asarray(found.translations) - estimate.translations).max() > 1e-5

@@ -9,9 +9,10 @@ from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.refinement.covariance_learning import learn_covariance
 from pliant.solver.refinement.joint_refinement import refine_cameras
+from pliant.solver.tracks.normalization import Normalized
 
 
-def learn(estimate: CameraEstimate, shown: np.ndarray, **more: Any) -> tuple[CameraEstimate, ShapeCovariance]:
-    """Return the cameras of `refine_cameras` and the covariance of `learn_covariance`."""
-    refined, data = refine_cameras(estimate, shown, **more)
+def learn(estimate: CameraEstimate, normalized: Normalized, **more: Any) -> tuple[CameraEstimate, ShapeCovariance]:
+    """Return the cameras of `refine_cameras`, learned from every frame, and the covariance of `learn_covariance`."""
+    refined, data = refine_cameras(estimate, normalized, np.ones(len(normalized.points), dtype=bool), **more)
     return learn_covariance(refined, data, should_stop=more.get("should_stop"))
