@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
-import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -30,20 +28,11 @@ def is_film(path: Path, region: Path | None) -> bool:
 
 @contextmanager
 def as_one_file(path: Path) -> Iterator[Path]:
-    """Yield the file to send to a service: a folder of pictures is packed into a temporary zip, whose bytes depend on the pictures only."""
-    from pliant.worker.films.sources import PICTURES
+    """Yield the file to send to a service: a folder of pictures is packed into a temporary zip."""
+    from pliant.client.input_files import film_file
 
-    if not path.is_dir():
-        yield path
-        return
     with tempfile.TemporaryDirectory(prefix="pliant-pictures-") as scratch:
-        packed = Path(scratch) / "pictures.zip"
-        with zipfile.ZipFile(packed, "w") as archive:
-            for each in sorted(path.iterdir()):
-                if each.suffix.lower() in PICTURES and each.name[0] != "." and each.is_file():
-                    with each.open("rb") as picture, archive.open(zipfile.ZipInfo(each.name), "w") as entry:
-                        shutil.copyfileobj(picture, entry)
-        yield packed
+        yield film_file(path, Path(scratch)) if path.is_dir() else path
 
 
 def refuse_parts_of_tracks(**parts: object) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from pliant.cli.films import as_one_file, is_film
+from pliant.cli.films import is_film
 from pliant.cli.ids import find_job
 from pliant.cli.paths import check_inputs, different_files, output_folder, results_folder
 from pliant.cli.session import (
@@ -95,8 +95,8 @@ def submit(
         "name": name_of(name, tracks), "job_id": job_id, "idempotency_key": key, "priority": priority, "timeout": timeout,
         "webhook_secret": None if webhook is None else os.environ.get("PLIANT_WEBHOOK_SECRET"),
     }  # fmt: skip
-    with session.client(url, as_json=as_json) as client, as_one_file(tracks) as file:
-        given["film" if is_film(tracks, region) else "tracks"] = file
+    with session.client(url, as_json=as_json) as client:
+        given["film" if is_film(tracks, region) else "tracks"] = tracks
         job = _submitted(session, client, given, wait=waits, output=output, force=force)
         show_job(job.record, as_json=as_json)
         if not job.status.final and not as_json:

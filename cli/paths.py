@@ -65,11 +65,11 @@ def tracks_or_film(path: Path) -> None:
         The path is missing, not readable, or a folder without pictures.
     """
     from pliant.client.errors import BadArgument
-    from pliant.worker.films.sources import PICTURES
+    from pliant.schemas.pictures import pictures_in
 
     if not path.is_dir():
         input_file(path, "tracks")
-    elif not any(each.suffix.lower() in PICTURES for each in path.iterdir()):
+    elif not pictures_in(path):
         raise BadArgument(
             f"tracks: expected a file or a folder of pictures, got the folder {path}, which has no pictures. "
             "Give the path of a file in it."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import zipfile
 from collections.abc import Mapping
 from numbers import Integral
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pliant.client.errors import BadArgument
+from pliant.schemas.pictures import SUFFIXES, pictures_in
 
 Source = ArrayLike | Mapping[str, Any] | Path | str
 """An array, a dictionary of arrays as a tracker returns it, or the path of a file."""
@@ -20,7 +22,10 @@ Source = ArrayLike | Mapping[str, Any] | Path | str
 Region = NDArray[np.bool] | NDArray[np.uint8] | Path | str
 """A mask of a film's size: an array (H, W) of bool, or of uint8 with 128 and above inside, or the path of a picture."""
 
-EXPECTED = {"film": "the path of a film", "region": "the path of a mask picture, or an array (H, W)"}
+EXPECTED = {
+    "film": "the path of a film or of a folder of pictures",
+    "region": "the path of a mask picture, or an array (H, W)",
+}
 """What an input may be that is no array or dictionary of arrays."""
 
 LONGEST_NAME = 200
@@ -53,6 +58,38 @@ def tracks_file(tracks: Source, visible: ArrayLike | None, folder: Path) -> Path
     elif hidden is not None:
         arrays["visibility"] = ~hidden
     return _npz(folder / "tracks.npz", arrays)
+
+
+def film_file(film: Path | str, folder: Path) -> Path:
+    """Return the file of a film; a folder of pictures is packed into a zip, whose bytes depend only on the pictures and their names.
+
+    Raises
+    ------
+    BadArgument
+        There is no such film, or the folder has no pictures.
+    """
+    if not isinstance(film, str | Path) or not (given := expanded(film, "film")).is_dir():
+        return existing_file(film, "film")
+    try:
+        pictures = pictures_in(given)
+    except OSError as fault:
+        raise BadArgument(
+            f"film: the folder {given} cannot be read: {fault.strerror}. Change its permissions."
+        ) from None
+    if not pictures:
+        raise BadArgument(
+            f"film: expected a film or a folder of pictures ({', '.join(SUFFIXES)}), got the folder {given}, which has none. "
+            "Export the film's frames as PNG or JPEG, numbered in order."
+        )
+    packed = folder / "pictures.zip"
+    with zipfile.ZipFile(packed, "w") as archive:
+        for picture in pictures:
+            with (
+                existing_file(picture, "film").open("rb") as source,
+                archive.open(zipfile.ZipInfo(picture.name), "w") as member,
+            ):
+                shutil.copyfileobj(source, member)
+    return packed
 
 
 def mesh_part(mesh: Source | tuple[int, int], folder: Path) -> Path | str:
@@ -160,8 +197,7 @@ def existing_file(path: Path | str, name: str) -> Path:
         raise BadArgument(f"{name}: expected the path of a file, got {kind_of(path)}. Give a str or a pathlib.Path.")
     found = expanded(path, name)
     if found.is_dir():
-        hint = "Put its pictures into a zip and give that" if name == "film" else "Give the path of a file in it"
-        raise BadArgument(f"{name}: expected a file, got the folder {found}. {hint}.")
+        raise BadArgument(f"{name}: expected a file, got the folder {found}. Give the path of a file in it.")
     if not found.is_file():
         expected = EXPECTED.get(name, "a file, an array or a dictionary of arrays")
         raise BadArgument(f"{name}: expected {expected}, got no file at {found}. Check the path.")

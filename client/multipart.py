@@ -16,7 +16,7 @@ from pliant.client.input_files import (
     Region,
     Source,
     array_part,
-    existing_file,
+    film_file,
     kind_of,
     mesh_part,
     refuse_visible,
@@ -153,7 +153,7 @@ class Inputs:
             )
         if self.film is not None:
             refuse_visible(self.visible)
-            files = {"film": existing_file(self.film, "film")}
+            files = {"film": film_file(self.film, folder)}
         elif self.tracks is not None:
             files = {"tracks": tracks_file(self.tracks, self.visible, folder)}
         if self.region is not None:

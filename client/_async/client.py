@@ -90,7 +90,8 @@ class AsyncClient(AsyncConnection):
             Points (F, P, 2) in pixels, NaN or masked where hidden; or the dictionary of a tracker (CoTracker, TAPIR, …);
             or the path of a file in any format that the service reads.
         film : path, optional
-            A film instead of tracks: mp4, mov, webm, mkv, avi, animated GIF or a zip of pictures. The job tracks its points.
+            A film instead of tracks: mp4, mov, webm, mkv, avi, animated GIF, or a zip or folder of
+            pictures. The job tracks its points.
         region : path or array, optional
             Region to track in the film: a mask of the film's size, either a picture that is white inside, or an array (H, W) of
             bool, or of uint8 with 128 and above inside. Without it and without the option `region_polygon`, the entire picture

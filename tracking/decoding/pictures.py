@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps, UnidentifiedImageError
+from pliant.schemas.pictures import SUFFIXES, pictures_in
 from pliant.tracking.decoding.containers import openable
 from pliant.tracking.decoding.limits import FilmLimits
 from pliant.tracking.errors import FilmError
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP")
 DEFAULT_DURATION = 100
 """Display time, ms, of a GIF frame without a duration, as in browsers."""
@@ -129,14 +129,7 @@ def folder_pictures(path: Path, limits: FilmLimits) -> Iterator[Listed]:
         Not readable, no pictures, or more bytes than the limit.
     """
     with openable(path):
-        files = sorted(
-            (
-                file
-                for file in path.iterdir()
-                if file.suffix.lower() in SUFFIXES and file.is_file() and file.name[0] != "."
-            ),
-            key=lambda file: natural(file.name),
-        )
+        files = sorted(pictures_in(path), key=lambda file: natural(file.name))
         size = sum(file.stat().st_size for file in files)
     _check_list(path.name, len(files), size, limits)
     yield [(file.name, partial(_read, file)) for file in files]

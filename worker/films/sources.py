@@ -18,7 +18,6 @@ _MARK, _FILM, _REGION = "film.json", "film", "region"
 """Members of a stored source: version and file names, the film, the mask picture."""
 
 SUFFIXES = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".m3u8", ".3gp")
-PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import httpx
 import numpy as np
 import pytest
 from pliant.client import BadArgument, Client, NotLoaded, Options
-from pliant.client.input_files import array_part, existing_file, mesh_part, region_part, tracks_file
+from pliant.client.input_files import array_part, existing_file, film_file, mesh_part, region_part, tracks_file
 from pliant.client.multipart import Form, Inputs, checked_options
 from pliant.service.testing import InMemoryService
 from pliant.tracking.region import read_region
@@ -127,7 +128,7 @@ def test_a_region_can_be_an_array_or_a_file(inside: object, tmp_path: Path) -> N
         (lambda here: mesh_part(object(), here), "mesh: expected an array of numbers or booleans, got a value of type object"),
         (
             lambda here: Inputs(tracks=None, film="nofilm.mp4").form(here, {}, None),
-            r"^film: expected the path of a film, got no file at nofilm\.mp4\. Check the path\.$",
+            r"^film: expected the path of a film or of a folder of pictures, got no file at nofilm\.mp4\. Check the path\.$",
         ),
         (
             lambda here: region_part("nomask.png", here),
@@ -203,8 +204,35 @@ def test_a_plot_shows_the_requested_frames(tmp_path: Path) -> None:
 def test_a_folder_is_not_an_input(tmp_path: Path) -> None:
     with pytest.raises(BadArgument, match="got the folder"):
         existing_file(tmp_path, "mesh")
-    with pytest.raises(BadArgument, match="Put its pictures into a zip"):
-        existing_file(tmp_path, "film")
+    (tmp_path / "notes.md").write_text("no picture")
+    with pytest.raises(BadArgument, match=r"film: expected a film or a folder of pictures \(\.png, .*, which has none"):
+        film_file(tmp_path, tmp_path)
+
+
+def test_a_folder_that_cannot_be_read_is_not_a_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(folder: Path) -> list[Path]:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("pliant.client.input_files.pictures_in", refuse)
+    with pytest.raises(BadArgument, match=r"film: the folder .* cannot be read: Permission denied\. Change its perm"):
+        film_file(tmp_path, tmp_path)
+
+
+def test_the_zip_of_a_folder_of_pictures_depends_only_on_its_pictures(tmp_path: Path) -> None:
+    sent = []
+    for name, order in (("first", (3, 0, 2, 1)), ("second", range(4))):
+        folder, scratch = tmp_path / name, tmp_path / f"scratch of {name}"
+        folder.mkdir()
+        scratch.mkdir()
+        for number in order:
+            (folder / f"{number}.PNG").write_bytes(bytes([number]))
+        (folder / "notes.md").write_text(name)
+        (folder / ".hidden.png").write_bytes(b"")
+        packed = film_file(folder, scratch)
+        sent.append(packed.read_bytes())
+        with zipfile.ZipFile(packed) as archive:
+            assert archive.namelist() == ["0.PNG", "1.PNG", "2.PNG", "3.PNG"]
+    assert sent[0] == sent[1]
 
 
 @pytest.mark.skipif(os.fsencode("\udcff") != b"\xff", reason="names of files are text here")
