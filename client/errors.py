@@ -29,14 +29,15 @@ from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from http import HTTPStatus
 
+from pliant.schemas.invalid import Picklable
 from pliant.schemas.job import Job, Problem
 from pydantic import ValidationError
 
 PROBLEM_TYPE = "application/problem+json"
 
 
-class PliantError(Exception):
-    """Base of all errors of the SDK."""
+class PliantError(Picklable):
+    """Base of all errors of the SDK; each has a `code`, a stable machine-readable name."""
 
 
 class Unreachable(PliantError):
@@ -48,6 +49,9 @@ class Unreachable(PliantError):
 
 class WaitTimeout(PliantError, TimeoutError):
     """The caller's `timeout` passed. Nothing was cancelled: the job continues and can be waited for again."""
+
+    code = "wait_timeout"
+    """Stable machine-readable name."""
 
 
 class UnexpectedAnswer(PliantError):
@@ -91,9 +95,15 @@ class BadArgument(PliantError, ValueError):
 class NotLoaded(PliantError):
     """A result's arrays were read before they were downloaded."""
 
+    code = "not_loaded"
+    """Stable machine-readable name."""
+
 
 class InvalidSignature(PliantError):
     """A webhook message is forged, altered or too old."""
+
+    code = "invalid_signature"
+    """Stable machine-readable name."""
 
 
 class APIStatusError(PliantError):
@@ -108,9 +118,12 @@ class APIStatusError(PliantError):
     """
 
     def __init__(self, problem: Problem, *, retry_after: float | None = None) -> None:
-        super().__init__(problem.detail)
+        super().__init__(problem)
         self.problem = problem
         self.retry_after = retry_after
+
+    def __str__(self) -> str:
+        return self.problem.detail
 
     @property
     def code(self) -> str:
@@ -157,8 +170,11 @@ class JobEnded(PliantError):
     """
 
     def __init__(self, job: Job) -> None:
-        super().__init__(_ending(job))
+        super().__init__(job)
         self.job = job
+
+    def __str__(self) -> str:
+        return _ending(self.job)
 
 
 class JobFailed(JobEnded):
@@ -172,6 +188,9 @@ class JobFailed(JobEnded):
 
 class JobCancelled(JobEnded):
     """The job was cancelled."""
+
+    code = "cancelled"
+    """Stable machine-readable name."""
 
 
 BY_STATUS: Mapping[int, type[APIStatusError]] = {

@@ -1,17 +1,26 @@
-"""The base class of errors about invalid values: code, field, expected value, given value and remedy.
+"""Base classes of errors: one that can be pickled, and one about invalid values: code, field, expected value, given value and remedy.
 
 The attributes are members of a problem document. Only the standard library is imported, so that the solver can use it, too.
 """
 
 from __future__ import annotations
 
+import copyreg
 from collections.abc import Mapping
+from typing import Any
 
 SIDES = ("field", "expected", "got", "hint")
 """Attributes of `Invalid`, besides its code."""
 
 
-class Invalid(Exception):
+class Picklable(Exception):
+    """An error that can be copied and sent between processes, whatever arguments its class is created with."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
+
+
+class Invalid(Picklable):
     """A given value is invalid. Each package derives its errors from this class and from its own base class.
 
     Attributes

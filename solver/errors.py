@@ -12,14 +12,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pliant.schemas.invalid import Invalid
+from pliant.schemas.invalid import Invalid, Picklable
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import ArrayLike, NDArray
 
 
-class SolverError(Exception):
+class SolverError(Picklable):
     """The solver failed."""
 
 

@@ -7,13 +7,13 @@ TrackingError              base: catch this one
 
 from __future__ import annotations
 
-from pliant.schemas.invalid import Invalid
+from pliant.schemas.invalid import Invalid, Picklable
 
 FILM_SLOWLY = "Film more slowly and with more light, so that successive frames overlap and are not blurred."
 """Hint for films in which points are lost."""
 
 
-class TrackingError(Exception):
+class TrackingError(Picklable):
     """The film could not be tracked."""
 
 

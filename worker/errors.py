@@ -5,11 +5,11 @@ Each error has a stable `code`, a message that is a complete sentence, and a fla
 
 from __future__ import annotations
 
-from pliant.schemas.invalid import Invalid
+from pliant.schemas.invalid import Invalid, Picklable
 from pliant.schemas.job import Status
 
 
-class WorkerError(Exception):
+class WorkerError(Picklable):
     """Base class of the errors of the worker package.
 
     Attributes

@@ -54,7 +54,7 @@ def submit(
     fields = option_fields(options) | {key: text for key, text in texts.items() if text != ""}
     whole = in_place(partial(inputs.form, folder, fields, exchange.attempts.bounding(on_upload)))
     key = idempotency_key if idempotency_key is not None else secrets.token_urlsafe(16)
-    headers = key_header(key) if job_id is None else {}
+    headers = key_header(key) if job_id is None or idempotency_key is not None else {}
     for attempt in (1, 2, 3):
         form = upload_large(exchange, whole, key if job_id is None else f"id:{job_id}")
         call = Call(

@@ -179,6 +179,14 @@ def test_inspecting_returns_the_interpretation_without_creating_a_job(client: Cl
     assert caught.value.code == "too_few_frames"
 
 
+def test_a_key_also_counts_beside_an_id(client: Client) -> None:
+    key, points = secrets.token_hex(4), np.random.default_rng(7).normal(size=(5, 30, 2))
+    first = client.submit(points, options=FAST, job_id=f"take-{key}", idempotency_key=key)
+    assert client.submit(points, options=FAST, job_id=first.id, idempotency_key=key).id == first.id
+    with pytest.raises(NotAllowedNow, match="key"):
+        client.submit(points + 1, options=FAST, idempotency_key=key)
+
+
 def test_the_same_idempotency_key_creates_one_job(client: Client) -> None:
     points, key = moving_points(), secrets.token_hex()
     first = client.submit(points, options=FAST, idempotency_key=key)

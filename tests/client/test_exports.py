@@ -3,13 +3,37 @@
 from __future__ import annotations
 
 import inspect
+import pickle
 import subprocess
 import sys
 
 import pliant.client
 import pytest
-from pliant.client import AsyncClient, AsyncRemoteJob, AsyncResult, Client, RemoteJob, Result, errors
+from pliant.client import (
+    AsyncClient,
+    AsyncRemoteJob,
+    AsyncResult,
+    Client,
+    Job,
+    Problem,
+    RemoteJob,
+    Result,
+    errors,
+)
+from pliant.solver import InvalidSettings, NotFinite
+from pliant.tracking.errors import FilmError
+from pliant.worker.errors import OffsetMismatch
 
+FAILED = {
+    "id": "a-job", "status": "failed",
+    "progress": {"stage": "solving", "fraction": 0.5, "updated_at": "2026-01-02T03:04:05Z"},
+    "options": {}, "created_at": "2026-01-02T03:04:05Z",
+    "error": {"code": "worker_lost", "title": "Lost", "status": 500, "detail": "The worker ended."},
+    "interpretation": {
+        "num_frames": 5, "num_points": 30, "num_faces": 0, "hidden_fraction": 0, "mesh_source": "none", "has_ground_truth": False,
+        "has_rotations": False, "layout": "tracks (F, P, 2)", "notes": [],
+    },
+}  # fmt: skip
 PAIRS = [(Client, AsyncClient), (RemoteJob, AsyncRemoteJob), (Result, AsyncResult)]
 
 
@@ -23,6 +47,31 @@ def test_every_exported_name_exists_and_every_error_is_exported() -> None:
     assert set(pliant.client.__all__) <= set(dir(pliant.client))
     with pytest.raises(AttributeError, match="no attribute 'Clinet'"):
         _ = pliant.client.Clinet
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        errors.NotFound(Problem(code="unknown_job", title="No such job", status=404, detail="gone"), retry_after=2.0),
+        errors.JobFailed(Job.model_validate(FAILED)),
+        errors.UnexpectedAnswer("a proxy", status=502),
+        errors.BadArgument("wrong", code="invalid_option"),
+        errors.WaitTimeout("late"),
+        errors.Unreachable("nobody"),
+        InvalidSettings("out_of_range", field="seed", expected="0 or more", got="-1", hint="Set it."),
+        NotFinite("The energy is infinite"),
+        FilmError("no_picture", field="film", expected="pictures", got="none", hint="Export them."),
+        OffsetMismatch("one", expected=4, got=2),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_errors_pass_between_processes(error: Exception) -> None:
+    """A process pool pickles them; an error that cannot be unpickled breaks the pool and hides its cause."""
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is type(error)
+    assert str(again) == str(error)
+    assert vars(again) == vars(error)
+    assert again.code == error.code  # type: ignore[attr-defined]
 
 
 def test_the_documented_error_tree_matches_the_classes() -> None:

@@ -52,14 +52,15 @@ def make_outputs(
             return known, False
     stored = jobs.stored(id)
     job = stored.job
+    implicit = f"outputs {wish} of {stored.attempt_id}"  # a job of the same id may have been deleted
     submission = Submission(
-        options=request.applied_to(job.options), name=job.name, idempotency_key=idempotency_key or f"outputs {wish}",
+        options=request.applied_to(job.options), name=job.name, idempotency_key=idempotency_key or implicit,
         fingerprint=wish,
     )  # fmt: skip
     while (known := jobs.known(submission)) is not None:
         if idempotency_key is not None or known.status not in (Status.FAILED, Status.CANCELLED):
             return known, False
-        submission = replace(submission, idempotency_key=f"outputs {wish} after {known.id}")
+        submission = replace(submission, idempotency_key=f"{implicit} after {known.id}")
     _check(stored, submission)
     further = lifecycle.again(job, id=new_job_id(), now=jobs.clock(), outputs_of=id, options=submission.options)
     made = jobs.create_copy(further, submission, stored, inputs=_inputs_of(stored), result=f"{stored.prefix}{RESULT}")

@@ -19,7 +19,7 @@ from pliant.worker.errors import Conflict, OffsetMismatch, TooManyUploads, Unkno
 from pliant.worker.ids import check_id, is_id
 from pliant.worker.settings import Settings
 from pliant.worker.uploads.folder import LENGTH, PART, RESERVED, WHOLE, content, declared_length, locked, taken
-from pliant.worker.uploads.writer import Capacity, Writer, inconsistent
+from pliant.worker.uploads.writer import Capacity, Writer, agreed_length
 
 MAX_UPLOADS = 100
 """Maximum number of uploads per owner."""
@@ -107,9 +107,8 @@ class Uploads:
             if offset != held:
                 raise OffsetMismatch(id, expected=held, got=offset)
             known = declared_length(folder) if offset > 0 else None
-            if length is not None and known not in (None, length):
-                raise inconsistent(f"{known} bytes, as declared in the first request", str(length))
-            writer = Writer(id=id, folder=folder, length=length if length is not None else known, capacity=capacity)
+            agreed = agreed_length(length, known=known, offset=offset)
+            writer = Writer(id=id, folder=folder, length=agreed, capacity=capacity)
             try:
                 writer.open(offset)
                 yield writer

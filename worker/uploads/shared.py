@@ -22,7 +22,7 @@ from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.uploads.service import LATE, MAX_UPLOADS, Uploads
 from pliant.worker.uploads.states import State, UploadStates, open_states
-from pliant.worker.uploads.writer import Capacity, Writer, inconsistent
+from pliant.worker.uploads.writer import Capacity, Writer, agreed_length
 
 FOLDER = "uploads/"
 """Prefix of the blob keys."""
@@ -73,14 +73,12 @@ class SharedUploads(Uploads):
         if offset != held:
             raise OffsetMismatch(id, expected=held, got=offset)
         known = before.length if before is not None and offset > 0 else None
-        if length is not None and known not in (None, length):
-            raise inconsistent(f"{known} bytes, as declared in the first request", str(length))
+        agreed = agreed_length(length, known=known, offset=offset)
         if before is None and sum(name.startswith(f"{self._owner}/") for name in self.states.names()) >= MAX_UPLOADS:
             raise TooManyUploads(MAX_UPLOADS)
         writer = SharedWriter(
-            id=id, folder=self.directory, length=length if length is not None else known, capacity=capacity, uploads=self,
-            before=before,
-        )  # fmt: skip
+            id=id, folder=self.directory, length=agreed, capacity=capacity, uploads=self, before=before
+        )
         try:
             writer.open(offset)
             yield writer

@@ -183,6 +183,23 @@ class Writer:
         return size if self.length is not None else min(size + RESERVED_AT_A_TIME, free)
 
 
+def agreed_length(given: int | None, *, known: int | None, offset: int) -> int | None:
+    """Return the bytes of the complete upload, from this request or an earlier one; None if no request has declared them.
+
+    Raises
+    ------
+    InvalidRequest
+        The request declares another length than an earlier one, or fewer bytes than are held already.
+    """
+    if given is None:
+        return known
+    if known not in (None, given):
+        raise inconsistent(f"{known} bytes, as declared in an earlier request", str(given))
+    if given < offset:
+        raise inconsistent(f"at least the {offset} bytes that are held already", str(given))
+    return given
+
+
 def inconsistent(expected: str, got: str) -> InvalidRequest:
     """Return the error for an upload that does not match its declared length."""
     return InvalidRequest(

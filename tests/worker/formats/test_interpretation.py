@@ -154,6 +154,22 @@ def test_confidence_is_read_as_visibility_and_multiplies_it(tmp_path: Path, name
             np.testing.assert_array_equal(got.tracks.visible > 0, seen if more else np.ones((F, P), bool))
 
 
+def test_documented_axes_are_not_swapped_to_reach_the_smallest_size(tmp_path: Path) -> None:
+    moved = np.random.default_rng(0).uniform(0, 500, (12, 3, 2))
+    sentence = r"at least 4 points, got 3 in tracks .* if it is tracks \(P, F, 2\), set layout=points_frames\."
+    with pytest.raises(InvalidInput, match=sentence):
+        read(tmp_path, {"tracks": moved})
+    assert read(tmp_path, {"tracks": moved}, layout="points_frames").tracks.points.shape == (3, 12, 2)
+
+
+def test_options_of_files_that_are_not_written_are_listed_as_not_used(tmp_path: Path) -> None:
+    options = {"outputs": ("glb", "csv"), "axes": "tracks", "normals": "none", "glb_quantized": True}
+    notes = read(tmp_path, {"tracks": POINTS}, **options).interpretation.notes
+    assert "Not used with outputs glb,csv: axes." in notes
+    notes = read(tmp_path, {"tracks": POINTS}, **{**options, "outputs": ("csv",)}).interpretation.notes
+    assert "Not used with outputs csv: axes, glb_quantized, normals." in notes
+
+
 def test_options_for_films_are_listed_as_not_used(tmp_path: Path) -> None:
     options = {"grid_step": 8, "region_polygon": [[0, 0], [9, 0], [9, 9]], "frames": "0:4"}
     assert (

@@ -80,6 +80,19 @@ def test_further_outputs_survive_deletion_of_the_solved_job(jobs: Jobs, solved: 
         make_outputs(jobs, solved.id, WANTED)
 
 
+def test_further_outputs_of_a_new_job_of_the_same_id_are_its_own(jobs: Jobs, tmp_path: Path) -> None:
+    made = []
+    for frames in (4, 5):
+        read = make_inputs(tmp_path / f"{frames}.npz", frames=frames, points=30).interpretation
+        job = jobs.submit(tmp_path / f"{frames}.npz", Submission(options=OPTIONS, id="take-1"), interpretation=read)
+        assert run(jobs, job, tmp_path / f"solving {frames}").status is Status.SUCCEEDED
+        more, new = make_outputs(jobs, "take-1", WANTED)
+        assert new
+        made.append(run(jobs, more, tmp_path / f"writing {frames}").interpretation.num_frames)
+        jobs.delete("take-1")
+    assert made == [4, 5]
+
+
 def test_a_result_that_vanishes_before_copying_leaves_no_job_or_files(jobs: Jobs, solved: Job) -> None:
     stored = jobs.stored(solved.id)
     jobs.blobs.delete(f"{stored.prefix}shapes.npz")

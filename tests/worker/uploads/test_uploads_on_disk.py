@@ -104,6 +104,15 @@ def test_the_declared_length_is_enforced_across_requests(uploads: Uploads) -> No
     assert uploads.get("one").complete
 
 
+def test_a_length_below_the_bytes_held_is_refused_and_not_remembered(uploads: Uploads) -> None:
+    send(uploads, "one", b"abc", finish=False)
+    with pytest.raises(errors.InvalidRequest, match="expected at least the 3 bytes that are held already, got 2"):
+        send(uploads, "one", b"", offset=3, length=2)
+    assert uploads.get("one").length is None
+    send(uploads, "one", b"d", offset=3)
+    assert uploads.get("one").complete
+
+
 def test_a_piece_beyond_the_length_is_dropped_and_earlier_ones_are_kept(uploads: Uploads) -> None:
     with uploads.write("one", offset=0, length=6, capacity=CAPACITY) as writer:
         writer.write(b"half")

@@ -155,6 +155,11 @@ def test_wrong_offsets_lengths_and_digests_are_refused(hosts: list[SharedUploads
     with pytest.raises(errors.OffsetMismatch) as wrong:
         send(two, "new", DATA[100:], offset=100)
     assert wrong.value.offset == 200
+    send(one, "open", b"abc", finish=False)
+    with pytest.raises(errors.InvalidRequest, match="expected at least the 3 bytes that are held already, got 2"):
+        send(two, "open", b"", offset=3, length=2)
+    assert two.get("open").length is None
+    two.delete("open")
     with pytest.raises(errors.InvalidRequest, match="768"):
         send(two, "new", DATA[200:], offset=200, length=999)
     with pytest.raises(errors.InvalidRequest, match="768"):

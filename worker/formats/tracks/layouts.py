@@ -60,7 +60,7 @@ class Reading:
 
 
 def readings(name: str, array: NDArray[np.generic]) -> list[Reading]:
-    """Return all interpretations of an array as `(F, P, 2)`; those with fewer than 3 frames or 4 points only as a last resort."""
+    """Return all interpretations of an array as `(F, P, 2)`."""
     found: list[Reading] = []
     if array.ndim == 3:
         for axis in [axis for axis in (2, 1, 0) if array.shape[axis] == 2]:
@@ -82,7 +82,12 @@ def readings(name: str, array: NDArray[np.generic]) -> list[Reading]:
             word = "rows" if order == "frames_points" else "columns"
             found.append(Reading(f"{name} {spelled_matrix}, {word} interleaved", order, "interleaved", pairs))
             found.append(Reading(f"{name} {spelled_matrix}, {word} stacked", order, "stacked", halves))
-    fit = [one for one in found if one.points.shape[0] >= MIN_FRAMES and one.points.shape[1] >= MIN_POINTS]
+    return found
+
+
+def usable(found: list[Reading]) -> list[Reading]:
+    """Return the readings with enough frames and points, and not too many frames if there are others; the first as a last resort."""
+    fit = [one for one in found if _is_enough(one)]
     return [one for one in fit if one.points.shape[0] <= MANY_FRAMES] or fit or found[:1]
 
 
@@ -132,7 +137,12 @@ def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: 
     AmbiguousInput
         Several interpretations fit.
     """
-    allowed = [one for one in readings(name, array) if _is_allowed(one, options)]
+    every = readings(name, array)
+    documented_axes = array.ndim != 3 or (dialect.name not in OF_ANY_ORDER and array.shape[2] == 2)
+    order = dialect.order if documented_axes else None
+    if array.ndim == 3 and options.layout == "auto":
+        _check_documented(name, array, every, order)
+    allowed = [one for one in usable(every) if _is_allowed(one, options)]
     if not allowed:
         raise InvalidInput(
             "wrong_shape", field="tracks", expected="(frames, points, 2) or a matrix of 2·frames rows, with 3 frames and 4 points or more",
@@ -143,8 +153,6 @@ def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: 
         return allowed[0], []
     costs = {one.layout: roughness(one.points) for one in allowed}
     ranked = sorted(allowed, key=lambda one: costs[one.layout])
-    documented_axes = array.ndim != 3 or (dialect.name not in OF_ANY_ORDER and array.shape[2] == 2)
-    order = dialect.order if documented_axes else None
     documented = [one for one in ranked if order in (None, one.order) or options.layout != "auto"] or ranked
     best, others = documented[0], documented[1:]
     clear = all(costs[other.layout] >= MIN_SMOOTHNESS_RATIO * costs[best.layout] for other in others)
@@ -160,18 +168,36 @@ def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: 
     )  # fmt: skip
 
 
+def _is_enough(reading: Reading) -> bool:
+    return reading.points.shape[0] >= MIN_FRAMES and reading.points.shape[1] >= MIN_POINTS
+
+
+def _check_documented(name: str, array: NDArray[np.generic], found: list[Reading], order: str | None) -> None:
+    """Refuse an array that has too few frames or points in its documented order, but not in the other one."""
+    documented = [one for one in found if one.order == order]
+    others = [one for one in found if one.order != order and _is_enough(one)]
+    if not documented or not others or _is_enough(documented[0]):
+        return
+    raise _too_few(name, array, documented[0], or_else=f"; if it is {others[0].layout}, set {_ways(others[:1])}")
+
+
 def _check_size(name: str, array: NDArray[np.generic], reading: Reading) -> None:
     """Refuse an array without a reading of enough frames and points, and state how it was read, unless it was used as it is."""
     if reading.points.shape == array.shape:
         return  # `Tracks` refuses it, also after a selection
+    if not _is_enough(reading):
+        raise _too_few(name, array, reading, or_else=", or save the array as (frames, points, 2)")
+
+
+def _too_few(name: str, array: NDArray[np.generic], reading: Reading, *, or_else: str) -> InvalidInput:
+    """Return the error for a reading with too few frames or points."""
     frames, count = reading.points.shape[:2]
     what, number, least = ("frames", frames, MIN_FRAMES) if frames < MIN_FRAMES else ("points", count, MIN_POINTS)
-    if number < least:
-        raise InvalidInput(
-            "too_few_frames" if what == "frames" else "too_few_points", field="tracks", expected=f"at least {least} {what}",
-            got=f"{number} in {name} of shape {array.shape}, read as {reading.layout}",
-            hint=f"Track {'a longer clip' if what == 'frames' else 'more points'}, or save the array as (frames, points, 2).",
-        )  # fmt: skip
+    return InvalidInput(
+        "too_few_frames" if what == "frames" else "too_few_points", field="tracks", expected=f"at least {least} {what}",
+        got=f"{number} in {name} of shape {array.shape}, read as {reading.layout}",
+        hint=f"Track {'a longer clip' if what == 'frames' else 'more points'}{or_else}.",
+    )  # fmt: skip
 
 
 def _ways(readings: list[Reading]) -> str:
