@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated
 
 import typer
-from pliant.cli.exits import Exit
+from pliant.cli.exits import Exit, ending_in_order
 from pliant.cli.extras import require_server
 from pliant.cli.paths import RESULT_FILES, different_files, output_folder
 from pliant.cli.session import LINE_EVERY, Force, Json, Session
@@ -193,18 +193,6 @@ def report(
         screen.print("To see it in the browser: pliant demo --keep. For your own films: pliant up.")
     else:
         screen.print(Text.assemble(("The page:", "bold"), f" {url}  ", ("(Ctrl-C stops it)", "dim")))
-
-
-@contextmanager
-def ending_in_order() -> Iterator[None]:
-    """Make SIGTERM and the end of the terminal work like Ctrl-C, so that the service never outlives this process."""
-    numbers = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) != signal.SIG_IGN]  # as nohup
-    handlers = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
 
 
 @contextmanager

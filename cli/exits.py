@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import IntEnum
 from importlib import import_module
 from itertools import pairwise
@@ -173,3 +176,16 @@ def _suggest(fault: Any) -> None:
         fault.possibilities = [own[meant]]
     elif "option" in own and (name := closest(name, Options.model_fields) or ""):
         fault.message += f". An option of the reconstruction is given as -O {name}=VALUE"
+
+
+@contextmanager
+def ending_in_order() -> Iterator[None]:
+    """Make SIGTERM and the end of the terminal work like Ctrl-C, so that processes end and temporary files are removed."""
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    numbers = [each for each in numbers if signal.getsignal(each) != signal.SIG_IGN]  # as with nohup
+    handlers = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)

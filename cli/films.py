@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pliant.cli.exits import ending_in_order
 from pliant.cli.session import LINE_EVERY
 from pliant.cli.show import err, needs, out, show_warnings
 
@@ -61,25 +62,27 @@ def inspect_film(film: Path, *, region: Path | None, options: dict[str, Any], as
     InvalidInput
         The film, the region or an option cannot be used.
     """
-    from pliant.cli.show import print_json
+    from pliant.cli.show import print_json, shown_interpretation
     from pliant.client.multipart import checked_options
     from pliant.worker.films.sources import FilmSource
-    from pliant.worker.films.tracker import check_film
+    from pliant.worker.films.tracker import read_film
     from pliant.worker.settings import usable_cores
 
     checked = checked_options(options)
-    facts = check_film(FilmSource(film, region), checked, estimate=True, threads=usable_cores())
-    warnings, estimate = warnings_of_check(facts, region, checked), solving_estimate(facts, checked)
+    read = read_film(FilmSource(film, region), checked, estimate=True, threads=usable_cores())
+    facts, warnings = read.facts, warnings_of_check(read.facts, region, checked)
     if as_json:
-        needed = None if estimate is None else estimate.model_dump(mode="json")
-        print_json(facts.model_dump(mode="json") | {"estimate": needed, "warnings": warnings})
+        film_itself = facts.model_dump(mode="json", exclude={"first_frame"})
+        print_json({**shown_interpretation(read.interpretation), "film": film_itself, "warnings": warnings})
         return
     from rich.table import Table
     from rich.text import Text
 
     table = Table.grid(padding=(0, 2))
-    for name, words in film_rows(facts, checked, estimate):
+    for name, words in film_rows(facts, checked, read.interpretation.estimate):
         table.add_row(Text(name, "dim"), Text(words))
+    for note in read.interpretation.notes[1:]:  # the first one repeats the table
+        table.add_row(Text("note", "dim"), Text(note))
     out().print(table)
     show_warnings(warnings)
 
@@ -89,17 +92,6 @@ def warnings_of_check(facts: FilmFacts, region: Path | None, options: Options) -
     from pliant.tracking.advice import warnings_unread
 
     return warnings_unread(whole=region is None and options.region_polygon is None, frames=facts.frames)
-
-
-def solving_estimate(facts: FilmFacts, options: Options) -> Estimate | None:
-    """Return the estimated memory and time of the reconstruction; None where the number of frames or points is unknown."""
-    from pliant.worker.films.tracker import film_options
-    from pliant.worker.formats.cost import estimated
-
-    if not (facts.points and facts.frames):
-        return None
-    points = min(facts.points, options.max_points or facts.points)
-    return estimated(facts.frames, points, film_options(options, facts))
 
 
 def film_rows(facts: FilmFacts, options: Options, estimate: Estimate | None) -> list[tuple[str, str]]:
@@ -149,13 +141,12 @@ def solve_film(
     from pliant.solver import threads_limited
     from pliant.worker.execution.film import reconstruct_film
     from pliant.worker.films.sources import FilmSource
-    from pliant.worker.films.tracker import check_film, described, film_options
+    from pliant.worker.films.tracker import read_film
     from pliant.worker.settings import usable_cores
 
     checked = checked_options(options)
     source = FilmSource(film, region, own_rate="fps" in checked.model_fields_set)
-    facts = check_film(source, checked)
-    checked = film_options(checked, facts)
+    read = read_film(source, checked)
     printed: list[str] = []
 
     def on_warnings(warnings: Sequence[str]) -> None:
@@ -166,15 +157,17 @@ def solve_film(
 
     screen = err()
     if not as_json:
-        out().print(described(facts, checked).notes[0])
-    on_warnings(warnings_of_check(facts, region, checked))
+        for note in read.interpretation.notes:
+            out().print(note)
+    on_warnings(warnings_of_check(read.facts, region, read.options))
     with (
+        ending_in_order(),
         tempfile.TemporaryDirectory(prefix="pliant-film-") as scratch,
         progress_bar(screen, line_every=LINE_EVERY) as bar,
         threads_limited(threads),
     ):
         done = reconstruct_film(
-            source, checked, output, scratch=Path(scratch), name=name, threads=threads or usable_cores(),
+            source, read.options, output, scratch=Path(scratch), name=name, threads=threads or usable_cores(),
             on_progress=bar.on_step, on_warnings=on_warnings,
         )  # fmt: skip
     return replace(done, warnings=tuple(each for each in done.warnings if each not in printed))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -88,15 +89,15 @@ def submit(
         raise typer.Exit(batch.exit_code)
     tracks = chosen[0]
     check_inputs(tracks, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=region)
-    if output is not None:  # a named job may be an earlier one, whose files may be here already
-        output_folder(output, force=force or job_id is not None or key is not None)
     given = {
         "region": region, **parts, "options": options,
         "name": name_of(name, tracks), "job_id": job_id, "idempotency_key": key, "priority": priority, "timeout": timeout,
         "webhook_secret": None if webhook is None else os.environ.get("PLIANT_WEBHOOK_SECRET"),
     }  # fmt: skip
-    with session.client(url, as_json=as_json) as client:
-        given["film" if is_film(tracks, region) else "tracks"] = tracks
+    given["film" if is_film(tracks, region) else "tracks"] = tracks
+    known = job_id is not None or key is not None  # a named job may be an earlier one, whose files may be here already
+    place = nullcontext() if output is None else results_folder(output, force=force or known)
+    with place, session.client(url, as_json=as_json) as client:
         job = _submitted(session, client, given, wait=waits, output=output, force=force)
         show_job(job.record, as_json=as_json)
         if not job.status.final and not as_json:
@@ -118,7 +119,7 @@ def _submitted(
             done = job.wait(on_progress=bar.on_progress, load=False, timeout=given["timeout"])
             if output is not None:
                 output_folder(output, force=force, files=different_files(done.job, output))
-                done.download(output, on_download=bar.on_download)
+                done.download(output, on_download=bar.on_download, timeout=given["timeout"])
     return job
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import sys
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -59,8 +61,19 @@ def show_warnings(warnings: Iterable[str], screen: Console | None = None) -> Non
 
 
 def print_json(value: object) -> None:
-    """Print one JSON document."""
-    print(json.dumps(value, indent=2, ensure_ascii=False))
+    """Print one JSON document; characters that the output's encoding lacks, such as bytes of a path, are escaped."""
+    text = json.dumps(value, indent=2, ensure_ascii=False)
+    try:
+        text.encode(sys.stdout.encoding or "utf-8")
+    except UnicodeEncodeError:
+        text = json.dumps(value, indent=2)
+    print(text)
+
+
+def shown_interpretation(interpretation: Interpretation) -> dict[str, Any]:
+    """Return an interpretation for `--json`, without its pictures."""
+    shown: dict[str, Any] = interpretation.model_dump(mode="json", exclude={"sample", "first_frame"})
+    return shown
 
 
 def show_fault(fault: BaseException, sentence: str, code: Exit, *, as_json: bool, url: str | None = None) -> None:
@@ -68,7 +81,12 @@ def show_fault(fault: BaseException, sentence: str, code: Exit, *, as_json: bool
     details = details_of(fault)
     more = explained_at(details, url)
     if as_json:
-        document = {"exit_code": int(code), "detail": sentence, "code": type(fault).__name__, **details}
+        document = {
+            "exit_code": int(code),
+            "detail": sentence,
+            "code": "_".join(re.findall("[A-Z][a-z]*", type(fault).__name__)).lower(),
+            **details,
+        }
         err().print_json(json.dumps(document if more is None else {**document, "explained_at": more}))
         return
     screen = err()

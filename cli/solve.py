@@ -24,7 +24,15 @@ from pliant.cli.session import (
     one_numerical_thread,
     parse_options,
 )
-from pliant.cli.show import metrics_table, out, print_json, show_warnings, understood, verdict_lines
+from pliant.cli.show import (
+    metrics_table,
+    out,
+    print_json,
+    show_warnings,
+    shown_interpretation,
+    understood,
+    verdict_lines,
+)
 
 if TYPE_CHECKING:
     from pliant.schemas.job import Interpretation
@@ -154,7 +162,7 @@ def inspect(
                 ground_truth=ground_truth, rotations=rotations, options=options,
             )  # fmt: skip
     if as_json:
-        print_json(interpretation.model_dump(mode="json", exclude={"sample", "first_frame"}))
+        print_json(shown_interpretation(interpretation))
     else:
         show_understood(interpretation)
 

@@ -189,7 +189,7 @@ class JobFailed(JobEnded):
 class JobCancelled(JobEnded):
     """The job was cancelled."""
 
-    code = "cancelled"
+    code = "job_cancelled"
     """Stable machine-readable name."""
 
 

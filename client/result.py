@@ -28,6 +28,14 @@ LOADED = (ARRAYS, REPORT)
 """Files that `wait` and `result` download; the others are downloaded on demand."""
 
 
+class TemporaryFolder:
+    """A temporary folder that is removed together with the last object that refers to it."""
+
+    def __init__(self) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix="pliant-result-"))
+        weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
+
+
 class Reconstruction:
     """A job that succeeded, and its files in a local folder."""
 
@@ -35,13 +43,13 @@ class Reconstruction:
     """The final record: options, interpretation, metrics, warnings, artifacts."""
 
     folder: Path
-    """Folder of the downloaded files; a temporary folder is removed together with this object."""
+    """Folder of the downloaded files; a temporary folder is removed together with this object and its copies."""
 
     def __init__(self, job: Job, folder: Path | str | None) -> None:
         self.job = job
         if folder is None:
-            self.folder = Path(tempfile.mkdtemp(prefix="pliant-result-"))
-            weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+            self._kept = TemporaryFolder()
+            self.folder = self._kept.path
         else:
             self.folder = expanded(folder, "folder")
 

@@ -19,12 +19,11 @@ from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import Conflict, UnknownJob, UnknownUpload
 from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.sources import FilmSource, is_source, open_source, save_source
-from pliant.worker.films.tracker import TRACKING_OPTIONS, check_film, described, film_options
+from pliant.worker.films.tracker import TRACKING_OPTIONS, read_film
 from pliant.worker.formats import Limits, store_inputs
 from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.isolated_reader import check_stored
 from pliant.worker.formats.point_names import one_line
-from pliant.worker.formats.solver_settings import solver_settings
 from pliant.worker.formats.tracks.film_tracks import tracks_options
 from pliant.worker.formats.tracks.pixels import FRACTIONS
 from pliant.worker.jobs.service import Jobs
@@ -298,13 +297,10 @@ def _read_film(form: Form, options: Options, bounds: FilmBounds, target: Path | 
         region_name="the region" if region is None else region.name or "the region",
         own_rate="fps" in options.model_fields_set,
     )  # fmt: skip
-    facts = check_film(source, options, bounds, picture=picture)
-    options = film_options(options, facts)
-    solver_settings(options)
-    interpretation = described(facts, options)
+    read = read_film(source, options, bounds, picture=picture)
     if target is not None:
-        save_source(source, interpretation, target)
-    return ReadInputs(interpretation, options, facts.first_frame or None)
+        save_source(source, read.interpretation, target)
+    return ReadInputs(read.interpretation, read.options, read.facts.first_frame or None)
 
 
 def missing(part: str) -> Refusal:

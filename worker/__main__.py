@@ -28,7 +28,12 @@ from pliant.worker.webhooks.sender import WebhookSender
 
 USAGE = "usage: python -m pliant.worker [work|reconcile|fsck]"
 
-PRELOADED = ("pliant.worker.formats.canonical", "pliant.worker.execution.pipeline")
+PRELOADED = (
+    "pliant.worker.formats.canonical",
+    "pliant.worker.execution.pipeline",
+    "pliant.worker.execution.film",
+    "pliant.worker.execution.further_outputs",
+)
 
 WATCH_ANSWERS_WITHIN = 2.0
 """Time limit of a heartbeat, seconds: supervision of the job must continue when the store hangs."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 from pathlib import Path
 
 FOLDERS = ("blobs", "incoming", "uploads", "valkey", "work")
@@ -33,13 +32,13 @@ def valkey_directory(data: Path) -> Path:
 
 
 def socket_path(data: Path) -> Path:
-    """Return the server's Unix socket: in the data directory, or in the temporary directory if that path is too long.
+    """Return the server's Unix socket: in the data directory, or in /tmp if that path is too long.
 
-    The short path consists of the user id and a hash of the long path, so that all processes with the same data directory
-    find the same socket.
+    The short path consists of the user id and a hash of the long path, and does not follow TMPDIR, so that all processes with the
+    same data directory find the same socket.
     """
     plain = valkey_directory(data) / "valkey.sock"
     if len(os.fsencode(plain)) <= LONGEST_SOCKET_PATH:
         return plain
     digest = hashlib.sha256(os.fsencode(plain)).hexdigest()[:16]
-    return Path(tempfile.gettempdir()) / f"pliant-{os.getuid()}-{digest}" / "valkey.sock"
+    return Path("/tmp") / f"pliant-{os.getuid()}-{digest}" / "valkey.sock"  # noqa: S108 - `valkey` checks who owns the folder

@@ -14,6 +14,7 @@ from pliant.cli.films import as_one_file, is_film
 from pliant.cli.paths import different_files, made_folder, output_folder, tracks_or_film
 from pliant.cli.session import LINE_EVERY, Session, name_of
 from pliant.cli.show import COLOURS, VERDICTS, details_of, err, explained_at, out, print_json
+from pliant.schemas.pictures import pictures_in
 
 if TYPE_CHECKING:
     from pliant.client import Client, RemoteJob
@@ -31,13 +32,18 @@ def expanded(given: list[Path], region: Path | None) -> list[Path]:
     Raises
     ------
     BadArgument
-        A folder is empty and there is no region; a pattern matches nothing or contains ``**``.
+        A folder is empty and there is no region, or contains both track files and pictures; a pattern matches nothing or contains ``**``.
     """
     from pliant.client.errors import BadArgument
 
     found: list[Path] = []
     for path in given:
-        inside = track_files(path)
+        inside = [] if region is not None else track_files(path)
+        if inside and (pictures := pictures_in(path)):
+            raise BadArgument(
+                f"{path}: expected track files or the pictures of a film, got a folder with both "
+                f"({inside[0].name}, {pictures[0].name}). Name the track files, or move them to a folder of their own."
+            )
         if inside:
             found += inside
         elif path.is_dir() and region is None and not any(path.iterdir()):
@@ -167,6 +173,7 @@ class Batch:
             The service does not answer.
         """
         from pliant.client.errors import NotAuthorized, PliantError, Unreachable
+        from pliant.schemas.job import Status
 
         submitted: list[tuple[Row, RemoteJob]] = []
         secret = os.environ.get("PLIANT_WEBHOOK_SECRET") if self.shared.get("webhook") else None
@@ -178,11 +185,16 @@ class Batch:
             try:
                 film = is_film(file, None)
                 with as_one_file(file) as sent:
-                    job = client.submit(
-                        None if film else sent, film=sent if film else None, name=name_of("", file), options=self.options,
-                        idempotency_key=_key_of(sent, name_of("", file), common), priority=self.priority, timeout=self.timeout,  # type: ignore[arg-type]
-                        webhook_secret=secret, on_upload=bar.on_upload, **self.shared,
-                    )  # fmt: skip
+                    key = _key_of(sent, name_of("", file), common)
+                    while True:
+                        job = client.submit(
+                            None if film else sent, film=sent if film else None, name=name_of("", file), options=self.options,
+                            idempotency_key=key, priority=self.priority, timeout=self.timeout,  # type: ignore[arg-type]
+                            webhook_secret=secret, on_upload=bar.on_upload, **self.shared,
+                        )  # fmt: skip
+                        if job.status not in (Status.FAILED, Status.CANCELLED):
+                            break
+                        key = _after(key, job.id)  # an earlier job without a result does not prevent another one
             except (NotAuthorized, Unreachable):
                 raise
             except PliantError as error:
@@ -261,6 +273,11 @@ class Batch:
                 parts[name] = sha256(Path(path))
         digest = None if secret is None else hashlib.sha256(secret.encode()).hexdigest()
         return json.dumps([self.key, self.options, self.priority, parts, digest], sort_keys=True)
+
+
+def _after(key: str, job: str) -> str:
+    """Return the key of the submission that follows a job which failed or was cancelled."""
+    return f"batch/{hashlib.sha256(f'{key} after {job}'.encode()).hexdigest()}"
 
 
 def _key_of(file: Path, name: str, common: str) -> str:

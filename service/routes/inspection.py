@@ -38,7 +38,8 @@ NOT_SEEN = -1
 async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUploads) -> Inspection:
     """Read the parts of a job as `POST /v1/jobs` would, and return the interpretation without creating a job.
 
-    Inputs that a submission would refuse are refused with the same problem, including `choices`. Nothing is stored. `inputs_of` is
+    Inputs and options that a submission would refuse are refused with the same problem, including `choices`. Limits that depend on the
+    workers and on the owner are not checked: `estimate` states the memory that the job needs. Nothing is stored. `inputs_of` is
     refused: the interpretation of an earlier job's inputs is in its record.
     """
     rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)

@@ -60,6 +60,32 @@ def test_a_folder_a_pattern_or_a_list_submits_one_job_per_file(run: Run, takes: 
     assert len(jobs_of(run)) == 3, "the second and third command found the jobs of the first"
 
 
+def test_a_job_that_was_cancelled_is_submitted_again(service: InMemoryService, takes: Path) -> None:
+    files = [str(takes / f"take-{number}.npz") for number in (0, 1)]
+    slow = InMemoryService(steps=1000)
+
+    def submit() -> list[str]:
+        ran = CliRunner().invoke(app, ["submit", *files, "--mesh", "none", "--json"], obj=Session(transport=slow))
+        return [row["job"]["id"] for row in json.loads(ran.stdout)]
+
+    first = submit()
+    assert submit() == first
+    for command, code in (("cancel", Exit.DONE), ("watch", Exit.FAILED)):
+        ran = CliRunner().invoke(app, [command, first[0]], obj=Session(transport=slow))
+        assert ran.exit_code == code, ran.output
+    second = submit()
+    assert second[0] != first[0]
+    assert second[1] == first[1]
+    assert submit() == second
+
+
+def test_a_folder_with_tracks_and_pictures_is_refused(run: Run, takes: Path) -> None:
+    (takes / "frame-1.png").write_bytes(b"")
+    ran = run("submit", takes)
+    assert ran.exit_code == Exit.REFUSED
+    assert "got a folder with both (take-0.npz, frame-1.png). Name the track files" in " ".join(ran.output.split())
+
+
 def test_a_job_name_over_the_length_limit_is_shortened(run: Run, takes: Path) -> None:
     files = [(takes / "take-0.npz").rename(takes / f"{'x' * 230}.npz"), takes / "take-1.npz"]
     for _ in range(2):

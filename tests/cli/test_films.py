@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import films
@@ -84,14 +85,16 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
 
     ran = inspect(film, "--region", film.with_name("mask.png"), "--json")
     assert ran.exit_code == 0, ran.output
-    facts = json.loads(ran.stdout)
+    read = json.loads(ran.stdout)
+    assert (read["format"], read["num_frames"], read["image_size"]) == ("film (mp4)", 10, "96x72"), "as from a service"
+    facts = read["film"]
     assert (facts["width"], facts["height"], facts["frames"], facts["fps"], facts["rotation"]) == (96, 72, 10, 30.0, 0)
     assert facts["seconds"] == pytest.approx(1 / 3)
     assert 0 < facts["track_seconds"] < 60
-    assert 1e8 < facts["estimate"]["memory_bytes"] < 1e9
-    assert facts["estimate"]["seconds"] > 0
+    assert 1e8 < read["estimate"]["memory_bytes"] < 1e9
+    assert read["estimate"]["seconds"] > 0
     everything = json.loads(inspect(film, "--json").stdout)
-    assert 0 < facts["points"] < 0.5 * everything["points"]
+    assert 0 < facts["points"] < 0.5 * everything["film"]["points"]
     words = " ".join(inspect(films.turned_by_90(copied(film, tmp_path)), "-O", "frames=::2").output.split())
     for each in (
         "size 72×96 pixels",
@@ -102,11 +105,18 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
         "reconstruction about",
     ):
         assert each in words
-    assert facts["warnings"] == []
+    assert read["warnings"] == []
     assert [each[:19] for each in everything["warnings"]] == ["No region was given"]
     assert "warning No region was given" in words
     assert "warning Only 5 frames are tracked." in words
     assert "warning" not in inspect(film, "-O", "region_polygon=[[20,20],[70,20],[70,55]]").output
+    assert "note Not used for films: layout." in " ".join(inspect(film, "-O", "layout=points_frames").output.split())
+    for command in (inspect, partial(solve, film, "-o", tmp_path / "out")):
+        arguments = ("-O", "focal=500", "-O", "field_of_view=60")
+        refused = command(film, *arguments) if command is inspect else command(*arguments)
+        assert refused.exit_code == Exit.REFUSED
+        assert "field_of_view" in refused.output
+        assert "tracking" not in refused.output
     refused = inspect(film, "--mesh", "3x4")
     assert refused.exit_code == Exit.REFUSED
     assert "--mesh: expected tracks, got a film" in refused.output

@@ -74,9 +74,13 @@ def run(id: str, attempt_id: str, *, settings: Settings, worker: str) -> None:
 def _conclude(attempt: Attempt, stored: Stored, *, worker: str, settings: Settings) -> str:
     """Run a claimed attempt with redirected output and a memory limit, record its outcome and return it as one word."""
     directory = working_directory(settings, attempt.attempt_id)
-    directory.mkdir(parents=True, exist_ok=True)
     attempt.log(f"Attempt {stored.job.attempt} began on worker {worker}.")
-    with _own_output(directory / OUTPUT):
+    with contextlib.ExitStack() as stack:
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(_own_output(directory / OUTPUT))
+        except OSError as error:
+            return attempt.conclude(attempt.failed(error))
         try:
             with _limited_memory(settings.memory_limit):
                 end = work(attempt, stored, directory)
@@ -142,6 +146,14 @@ class Attempt:
         moment = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         with self._log_lock:
             self._lines += [f"{moment} {line}" for line in text.splitlines()]
+
+    def failed(self, error: Exception) -> Problem:
+        """Return the problem that an error ends the job with, and log it, with a traceback if it is unexpected."""
+        problem = problem_of(error, memory_limit=self.jobs.settings.memory_limit)
+        self.log(f"Failed: {problem.detail}")
+        if problem.code in ("internal_error", "storage_failed", "store_unavailable", "out_of_memory"):
+            self.log("".join(traceback.format_exception(error)))
+        return problem
 
     def conclude(self, end: Finished | Problem | None) -> str:
         """Record the outcome: the result, the problem, or None for a stop on request. Return the job's status.
@@ -252,11 +264,7 @@ def work(
     except (StaleAttempt, UnknownJob):
         raise
     except Exception as error:  # noqa: BLE001  every failure must end the job with a problem
-        problem = problem_of(error, memory_limit=attempt.jobs.settings.memory_limit)
-        attempt.log(f"Failed: {problem.detail}")
-        if problem.code in ("internal_error", "storage_failed", "store_unavailable", "out_of_memory"):
-            attempt.log("".join(traceback.format_exception(error)))
-        return problem
+        return attempt.failed(error)
     ended = " ".join(sentence for sentence in (finished.trust_sentence, finished.sentence) if sentence is not None)
     attempt.log(f"{ended} {_listed([each.name for each in finished.artifacts])}")
     return finished

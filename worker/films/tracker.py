@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, TypeVar
@@ -15,7 +15,9 @@ from pliant.solver.errors import InvalidInput
 from pliant.worker.errors import Interrupted
 from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.sources import FilmSource
+from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.errors import damaged, too_large
+from pliant.worker.formats.solver_settings import solver_settings
 from pliant.worker.formats.unused_options import notes_on_options
 from pliant.worker.processes.contained import DONE, REFUSED, Ended, refusal_in, run_contained
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -181,6 +183,45 @@ def notes_on_rate(container: str) -> list[str]:
     if container not in ("zip", "folder"):
         return []
     return ["Pictures state no frame rate: unless the option fps is given, 30 frames per second are assumed."]
+
+
+@dataclass(frozen=True, slots=True)
+class ReadFilm:
+    """A film that was checked, and how its job would treat it."""
+
+    facts: FilmFacts
+
+    options: Options
+    """With the film's picture size and frame rate."""
+
+    interpretation: Interpretation
+    """Of the film before it is tracked; `estimate` is that of the reconstruction, where frames and points were estimated."""
+
+
+def read_film(
+    source: FilmSource,
+    options: Options,
+    bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
+    *,
+    estimate: bool = False,
+    picture: bool = False,
+    threads: int = 1,
+) -> ReadFilm:
+    """Check a film and all options of its job without tracking it. Parameters are those of `check_film`.
+
+    Raises
+    ------
+    InvalidInput
+        The film or its region cannot be used, or an option does not fit them or another option.
+    """
+    facts = check_film(source, options, bounds, estimate=estimate, picture=picture, threads=threads)
+    options = film_options(options, facts)
+    solver_settings(options)
+    interpretation = described(facts, options)
+    if facts.frames and facts.points:
+        points = min(facts.points, options.max_points or facts.points)
+        interpretation = interpretation.model_copy(update={"estimate": estimated(facts.frames, points, options)})
+    return ReadFilm(facts, options, interpretation)
 
 
 def described(facts: FilmFacts, options: Options) -> Interpretation:

@@ -150,7 +150,7 @@ def _numbers(file: IO[bytes], size: int, field: str) -> int:
 def _in_process(parts: dict[str, Any], options: Options, limits: Limits, target: Path | None) -> bytes:
     request = {
         "parts": {name: {"path": str(part)} if isinstance(part, Path) else part for name, part in parts.items()},
-        "options": options.model_dump(mode="json"), "limits": asdict(limits),
+        "options": options.model_dump(mode="json", exclude_unset=True), "limits": asdict(limits),
         "target": None if target is None else str(target.absolute()),
     }  # fmt: skip
     with tempfile.TemporaryDirectory(prefix="pliant-read-") as scratch:  # also removes what a killed process leaves

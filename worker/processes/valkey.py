@@ -18,7 +18,7 @@ import stat
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -80,13 +80,12 @@ class Valkey:
         DataDirectoryInUse
             Another supervisor uses the directory, or its server does not stop.
         ServerFailed
-            There is no server binary, or the socket's directory belongs to another user.
+            There is no server binary.
         """
         binary = find_binary()
         home, path = valkey_directory(data), socket_path(data)
         make_data_directory(data)
         home.mkdir(parents=True, exist_ok=True, mode=0o700)
-        _make_private(path.parent)
         supervisor_lock = os.open(home / "supervisor.lock", os.O_RDWR | os.O_CREAT, 0o600)
         if not _lock(supervisor_lock):
             holder = os.read(supervisor_lock, 20).decode(errors="replace").strip()
@@ -121,7 +120,14 @@ class Valkey:
         raise ServerFailed(f"The embedded Valkey does not answer after {STARTS_WITHIN:g} s.", log=self.log_tail())
 
     def start(self) -> subprocess.Popen[bytes]:
-        """Start the server in a session of its own, so that Ctrl-C reaches the supervisor first, and wait for it."""
+        """Start the server in a session of its own, so that Ctrl-C reaches the supervisor first, and wait for it.
+
+        Raises
+        ------
+        ServerFailed
+            The server exited or did not answer in time, or other users can write to the socket's directory.
+        """
+        _make_private(socket_path(self.data).parent)
         process = subprocess.Popen(self.argv, pass_fds=(self.server_lock,), start_new_session=True)  # noqa: S603
         try:
             self.wait(process)
@@ -138,7 +144,11 @@ class Valkey:
         return " / ".join(log.read_text(errors="replace").splitlines()[-4:])
 
     def release(self) -> None:
-        """Unlock the directory; the server must have ended."""
+        """Remove the socket's directory if it is outside the data directory, and unlock; the server must have ended."""
+        directory = socket_path(self.data).parent
+        if directory != valkey_directory(self.data):
+            with suppress(OSError):  # it was never created, or contains other files
+                directory.rmdir()
         os.close(self.server_lock)
         os.close(self.supervisor_lock)
 

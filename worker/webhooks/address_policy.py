@@ -1,7 +1,7 @@
 """The policy on addresses that webhooks may be sent to.
 
 Clients choose the address, so it must not reach the service's own network: the host name is resolved once, each of its addresses
-must be public or in an allowed network, and the connection is made to the address that was checked.
+must be public or in an allowed network, and connections are only made to addresses that were checked.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ def resolve(host: str, port: int) -> list[Address]:
     return list(dict.fromkeys(ipaddress.ip_address(str(each[4][0]).partition("%")[0]) for each in found))
 
 
-def checked_address(host: str, addresses: list[Address], networks: str) -> Address:
-    """Return the address to connect to.
+def checked_addresses(host: str, addresses: list[Address], networks: str) -> list[Address]:
+    """Return the addresses to connect to, in the resolver's order.
 
     Raises
     ------
@@ -35,7 +35,7 @@ def checked_address(host: str, addresses: list[Address], networks: str) -> Addre
     if not addresses or not all(may_reach(each, networks) for each in addresses):
         found = "an address that is not on the public internet" if addresses else "no address"
         raise NotPublic(f"{host} resolves to {found}.")
-    return addresses[0]
+    return addresses
 
 
 def may_reach(address: Address, networks: str = "") -> bool:

@@ -24,7 +24,7 @@ from pliant.worker.records import Records, Webhook
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 from pliant.worker.store.outbox import Lease, Outbox
-from pliant.worker.webhooks.address_policy import Address, NotPublic, checked_address, resolve
+from pliant.worker.webhooks.address_policy import Address, NotPublic, checked_addresses, resolve
 from pliant.worker.webhooks.message import message, signed
 
 logger = logging.getLogger(__name__)
@@ -173,17 +173,18 @@ class WebhookSender:
             logger.warning("webhook of job %s: %s", lease.id, error)
 
     async def _post(self, webhook: Webhook, *, id: str, body: bytes) -> int:
-        """Send to the address that was checked; return the status of the response, whose body is not read."""
+        """Send to the first checked address that accepts a connection; return the status of the response, whose body is not read."""
         import httpx
 
         parts = urlsplit(webhook.url)
         host = parts.hostname or ""
         port = parts.port or (443 if parts.scheme == "https" else 80)
         addresses = await asyncio.get_running_loop().run_in_executor(self._lookups, self.resolve, host, port)
-        address = checked_address(host, addresses, self.networks)
+        checked = checked_addresses(host, addresses, self.networks)
+        timeout = httpx.Timeout(WITHIN, connect=WITHIN / len(checked))
         request = httpx.Request(
             "POST",
-            httpx.URL(webhook.url).copy_with(host=str(address), port=port, fragment=None),
+            httpx.URL(webhook.url).copy_with(host=str(checked[0]), port=port, fragment=None),
             content=body,
             headers={
                 "Host": parts.netloc,
@@ -192,15 +193,23 @@ class WebhookSender:
                 **signed(webhook.secret, id=id, timestamp=int(self.clock()), body=body),
             },
             # The certificate must match the host name, although the connection is made to the address.
-            extensions={"sni_hostname": host, "timeout": httpx.Timeout(WITHIN).as_dict()},
+            extensions={"sni_hostname": host, "timeout": timeout.as_dict()},
         )
         # No proxies, which would resolve the name again, and no redirects to other addresses.
         async with httpx.AsyncClient(
             trust_env=False, follow_redirects=False, timeout=WITHIN, verify=self.trusted
         ) as client:
-            answer = await client.send(request, stream=True)
-            await answer.aclose()
-        return answer.status_code
+            for address in checked:
+                request.url = request.url.copy_with(host=str(address))
+                try:
+                    answer = await client.send(request, stream=True)
+                except (httpx.ConnectError, httpx.ConnectTimeout):
+                    if address == checked[-1]:
+                        raise
+                else:
+                    await answer.aclose()
+                    return answer.status_code
+        raise AssertionError("unreachable: the last address returns or raises")
 
     # Log before the outbox changes: a finished message has its log line even if the process is killed in between.
 

@@ -229,3 +229,19 @@ def test_a_job_runs_even_if_the_reply_to_its_claim_is_lost(
     assert lost[0].job.status is Status.RUNNING
     job = jobs.get(id)
     assert (job.status, job.attempt) == (Status.SUCCEEDED, 1), job.error
+
+
+def test_a_scratch_folder_that_cannot_be_made_fails_the_job_with_its_cause(
+    jobs: Jobs, inputs_file: Path, interpretation: Interpretation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Jobs, "open", lambda _: jobs)
+    id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+    work_folder = jobs.settings.data / "work"
+    if work_folder.exists():
+        work_folder.rmdir()
+    work_folder.write_text("a file in place of the folder")
+    run(id, jobs.records.get(id).attempt_id, settings=jobs.settings, worker="w")
+    job = jobs.get(id)
+    assert job.error is not None
+    assert job.error.code == "storage_failed"
+    assert "NotADirectoryError" in jobs.log(id)

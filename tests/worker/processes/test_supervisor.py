@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from pliant.worker.errors import DataDirectoryInUse, ServerFailed, StoreUnavailable
-from pliant.worker.paths import FOLDERS, make_data_directory, socket_path, valkey_directory
+from pliant.worker.paths import FOLDERS, LONGEST_SOCKET_PATH, make_data_directory, socket_path, valkey_directory
 from pliant.worker.processes import valkey as valkey_module
 from pliant.worker.processes.supervisor import FIRST_PAUSE, Child, Supervisor, worker_children
 from pliant.worker.processes.valkey import Valkey, find_binary
@@ -268,16 +268,28 @@ def test_a_socket_directory_that_others_may_write_is_refused(tmp_path: Path) -> 
     directory.mkdir(mode=0o700)
     try:
         directory.chmod(0o777)
-        with pytest.raises(ServerFailed, match="is writable by other users"):
-            Valkey.claim(deep)
-        directory.chmod(0o700)
         valkey = Valkey.claim(deep)
+        with pytest.raises(ServerFailed, match="is writable by other users"):
+            valkey.start()
+        directory.chmod(0o700)
         server = valkey.start()
         server.terminate()
         server.wait(10)
         valkey.release()
+        assert not directory.exists()
     finally:
-        directory.rmdir()
+        if directory.exists():
+            directory.rmdir()
+
+
+def test_a_long_socket_path_does_not_follow_tmpdir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command with another TMPDIR than the server's would not find it otherwise."""
+    deep = tmp_path / "/".join(["deep"] * 30)
+    found = socket_path(deep)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    assert socket_path(deep) == found
+    assert len(str(found)) < LONGEST_SOCKET_PATH
 
 
 def test_a_socket_directory_that_is_a_link_is_refused(tmp_path: Path) -> None:
@@ -286,8 +298,10 @@ def test_a_socket_directory_that_is_a_link_is_refused(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     directory.symlink_to(tmp_path / "elsewhere")
     try:
+        valkey = Valkey.claim(deep)
         with pytest.raises(ServerFailed, match="is writable by other users"):
-            Valkey.claim(deep)
+            valkey.start()
+        valkey.release()
     finally:
         directory.unlink()
 

@@ -169,7 +169,8 @@ def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: 
 
 
 def _is_enough(reading: Reading) -> bool:
-    return reading.points.shape[0] >= MIN_FRAMES and reading.points.shape[1] >= MIN_POINTS
+    frames, count = reading.points.shape[:2]
+    return frames >= MIN_FRAMES and count >= MIN_POINTS
 
 
 def _check_documented(name: str, array: NDArray[np.generic], found: list[Reading], order: str | None) -> None:
