@@ -13,6 +13,7 @@ from typing import Any
 from pliant.schemas.options import Options
 from pliant.solver import Solution
 from pliant.solver.evaluation.trust import Trust
+from pliant.solver.records import Floats
 from pliant.worker.formats import Inputs
 
 REPORT_VERSION = 1
@@ -82,7 +83,8 @@ def described_camera(solution: Solution, options: Options) -> dict[str, Any]:
         "focal_std": camera.focal_std,
         "field_of_view": angle,
         "field_of_view_std": angle_std,
-        "sentence": _camera_sentence(choices.camera, camera.focal, camera.focal_std, angle, angle_std),
+        "sentence": _lens_sentence(choices.camera, camera.focal, camera.focal_std, angle, angle_std)
+        + _size_sentence(camera.scales),
         "principal_point": camera.principal_point.tolist(),
         "depth_sign": choices.depth_sign,
         "candidates": [asdict(each) for each in choices.focal_candidates],
@@ -90,7 +92,7 @@ def described_camera(solution: Solution, options: Options) -> dict[str, Any]:
     }
 
 
-def _camera_sentence(
+def _lens_sentence(
     model: str, focal: float | None, focal_std: float | None, angle: float | None, angle_std: float | None
 ) -> str:
     name = model.replace("_", " ").capitalize()
@@ -100,6 +102,14 @@ def _camera_sentence(
     view = "" if angle is None else f", horizontal field of view {angle:.1f}°"
     view += "" if angle is None or not angle_std else f" ± {_two_digits(angle_std)}°"
     return f"{name} camera, focal length {float(f'{focal:.4g}'):g} px{known}{view}."
+
+
+def _size_sentence(scales: Floats) -> str:
+    """Return how much the scales differ between frames, with a space before it; empty below 1 %."""
+    change = round(100 * (float(scales.max() / scales.min()) - 1))
+    if change < 1:
+        return ""
+    return f" Its distance changes by {change} %; an object that grows or shrinks would look the same."
 
 
 def _trust(trust: Trust | None) -> dict[str, Any]:

@@ -71,6 +71,27 @@ def test_the_report_states_the_field_of_view(focal: float | None, std: float | N
         assert report["field_of_view_std"] == pytest.approx((views[0] - views[1]) / 1e-3 * std, rel=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("farthest", "sentence"),
+    [
+        (
+            1.34,
+            "Scaled orthographic camera. Its distance changes by 34 %; an object that grows or shrinks would look the same.",
+        ),
+        (1.004, "Scaled orthographic camera."),
+    ],
+)
+def test_the_report_states_how_much_the_distance_of_the_camera_changes(farthest: float, sentence: str) -> None:
+    inputs, solution, options = make_result()
+    scales = np.linspace(1, farthest, len(solution.camera.scales))[::-1] * 2
+    solution = replace(
+        solution,
+        camera=replace(solution.camera, scales=scales),
+        choices=replace(solution.choices, camera="scaled_orthographic"),
+    )
+    assert build_report(inputs, solution, options, metrics={})["camera"]["sentence"] == sentence
+
+
 def test_the_report_describes_the_computation(tmp_path: Path) -> None:
     report = json.loads(write(tmp_path, make_result())["report.json"].read_text())
     assert report["outcome"] == "converged"
