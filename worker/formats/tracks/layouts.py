@@ -170,7 +170,7 @@ def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: 
 
 def _is_enough(reading: Reading) -> bool:
     frames, count = reading.points.shape[:2]
-    return frames >= MIN_FRAMES and count >= MIN_POINTS
+    return bool(frames >= MIN_FRAMES and count >= MIN_POINTS)
 
 
 def _check_documented(name: str, array: NDArray[np.generic], found: list[Reading], order: str | None) -> None:
