@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from datetime import UTC, datetime
@@ -11,7 +12,7 @@ import pytest
 from pliant.cli.commands.batch import Batch, Row
 from pliant.cli.demo import MEANINGS, report
 from pliant.cli.session import Session
-from pliant.cli.show import METRIC_MEANINGS, metrics_table, show_job, show_jobs, verdict_lines
+from pliant.cli.show import METRIC_MEANINGS, metrics_table, print_json, show_job, show_jobs, verdict_lines
 from pliant.cli.solve import show_finished
 from pliant.schemas.job import Interpretation, Job, Progress, Status
 from pliant.schemas.options import Options
@@ -185,3 +186,12 @@ def test_the_batch_table_shows_each_verdict_and_its_first_reason(capsys: pytest.
     batch.show(as_json=False)
     rows = [[cell.strip() for cell in line.split("│")] for line in capsys.readouterr().out.splitlines() if "│" in line]
     assert [row[4] for row in rows] == ["Use with care", REASON, "Good", "Do not use", "The residual is large.", ""]
+
+
+def test_json_escapes_what_the_output_cannot_encode(monkeypatch: pytest.MonkeyPatch) -> None:
+    for encoding, path in (("utf-8", "out\udcff"), ("ascii", "Gänge")):
+        screen = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+        monkeypatch.setattr("sys.stdout", screen)
+        print_json({"path": path})
+        screen.flush()
+        assert json.loads(screen.buffer.getvalue()) == {"path": path}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import gc
 import io
 import os
 import zipfile
@@ -199,6 +201,20 @@ def test_a_plot_shows_the_requested_frames(tmp_path: Path) -> None:
     picture = io.BytesIO()
     figure.savefig(picture)
     assert picture.getvalue()[:4] == b"\x89PNG"
+
+
+def test_a_copy_of_a_result_keeps_its_files() -> None:
+    with Client("http://pliant.test", transport=InMemoryService()) as client:
+        result = client.submit(POINTS).wait(timeout=60)
+    folder, other = result.folder, copy.copy(result)
+    shapes = result.shapes
+    del result
+    gc.collect()
+    np.testing.assert_array_equal(other.shapes, shapes)
+    assert folder.exists()
+    del other
+    gc.collect()
+    assert not folder.exists()
 
 
 def test_a_folder_is_not_an_input(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pliant.schemas.options import Options
 from pliant.solver.errors import InvalidInput
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.tracker import Tracked
-from pliant.worker.formats import load_inputs, read_inputs, save_inputs
+from pliant.worker.formats import load_inputs, read_inputs, save_inputs, store_inputs
 from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.tracks.film_tracks import tracks_options
 
@@ -40,6 +40,19 @@ def film_file(path: Path, **changed: object) -> Path:
     arrays = {name: value for name, value in (film_arrays() | changed).items() if value is not None}
     np.savez(path, **arrays)  # type: ignore[arg-type]
     return path
+
+
+def test_options_that_are_not_given_stay_so_in_the_isolated_reader(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The frame rate of a film's tracks follows from the selected frames unless the job gives one."""
+    film = film_file(tmp_path / "tracks.npz")
+    for given in ({}, {"fps": 50}):
+        options = Options(frames="::2", **given)
+        here = read_inputs(tracks=film, options=options).interpretation
+        monkeypatch.setattr("pliant.worker.formats.isolated_reader.LARGE", 0)
+        assert store_inputs(tracks=film, options=options, target=None).notes == here.notes
+        assert any("at the same fps" in note for note in here.notes) == bool(given)
 
 
 def test_every_array_of_the_tracker_is_used(tmp_path: Path) -> None:

@@ -252,6 +252,18 @@ def test_the_host_is_resolved_once_and_that_address_is_connected(
     assert headers["host"] == f"rebinding.example:{receiver.port}"
 
 
+def test_an_address_without_a_listener_is_followed_by_the_next(
+    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
+) -> None:
+    """A host with an IPv6 address that does not work is reached at its IPv4 address."""
+    webhook_sender.resolve = lambda host, port: [ipaddress.ip_address(each) for each in ("127.0.0.2", "127.0.0.1")]
+    job = made(f"http://both.example:{receiver.port}/hook")
+    webhook_sender.start()
+    until(lambda: "Webhook delivered" in door.log(job.id))
+    assert "(attempt 1)" in door.log(job.id)
+    assert len(receiver.got) == 1
+
+
 @pytest.fixture
 def certificate(receiver: Receiver, tmp_path: Path) -> Path:
     """A self-signed certificate for right.example, which the receiver uses."""
