@@ -127,6 +127,7 @@ def assess(
     depth_is_typical: bool = False,
     shown: NDArray[np.bool_] | None = None,
     behind: NDArray[np.bool_] | None = None,
+    unclear_camera: str | None = None,
 ) -> Trust:
     """Return the verdict on a result.
 
@@ -158,6 +159,8 @@ def assess(
         Frames that show enough points for a camera of their own; None for all.
     behind : ndarray of bool, shape (F,), optional
         Frames in which points lie behind the camera; None for none.
+    unclear_camera : str, optional
+        Sentence that states why the camera model is in doubt; None if it is not.
     """
     size = size_of(shapes)
     pulse()
@@ -180,6 +183,8 @@ def assess(
     if behind is not None and behind.any():
         which = _frames(behind, ordered=ordered)
         found.append((Verdict.DO_NOT_USE, f"In {which}, points of the shape lie behind the camera."))
+    if unclear_camera is not None:
+        found.append((Verdict.WITH_CARE, unclear_camera))
     if not shown.all():
         which = _frames(~shown, ordered=ordered)
         sentence = f"Hardly a point is visible in {which}: the shapes there are guesses. Keep the object in the picture, or leave them out."

@@ -287,7 +287,8 @@ class _Whole:
         )  # fmt: skip
         return judged(
             few, tracks, confidence, self._cameras.estimate if prior is None else estimate_with(self._cameras, prior),
-            None if prior is None else prior.normalized, held_out_error=float(np.median(left_out)) if left_out else None,
+            None if prior is None else prior.normalized, self._cameras.observations.normalized.unit,
+            held_out_error=float(np.median(left_out)) if left_out else None,
         )  # fmt: skip
 
 

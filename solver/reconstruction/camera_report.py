@@ -8,7 +8,7 @@ import numpy as np
 from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.model.marginal_likelihood import UNLIKELY
 from pliant.solver.records import Choices, FocalCandidate, KnownCamera
-from pliant.solver.refinement.focal_length import MIN_PERSPECTIVE_GAIN
+from pliant.solver.refinement.focal_length import MIN_PERSPECTIVE_GAIN, more_probable
 from pliant.solver.settings import Settings
 
 DIVERGED = "the depths of the points diverge with it"
@@ -77,16 +77,13 @@ def described(view: Perspective, unit: float) -> str:
 
 def improbable(view: Perspective, unit: float) -> str | None:
     """Return a warning if the given focal length is less probable than another one or orthography, else None."""
-    if view.given is None:
+    found = more_probable(view)
+    if found is None or view.given is None:
         return None
-    nll = {each.curvature: each.nll for each in view.candidates}
-    own = min((nll[each] for each in (view.given, -view.given) if each in nll), default=np.inf)
-    best = min(nll, key=lambda each: nll[each], default=0.0)
-    if not np.isfinite(own) or own - nll.get(best, np.inf) <= MIN_PERSPECTIVE_GAIN:
-        return None
+    best, gain = found
     other = "orthography" if best == 0 else f"a focal length of {unit / abs(best):.4g}"
-    gains = f"{other} gains {own - nll[best]:.3f} in the log likelihood per point and frame"
-    return f"The given focal length, {unit / view.given:.4g}, is improbable: {gains if own < UNLIKELY else DIVERGED}."
+    gains = f"{other} gains {gain:.3f} in the log likelihood per point and frame" if np.isfinite(gain) else DIVERGED
+    return f"The given focal length, {unit / view.given:.4g}, is improbable: {gains}."
 
 
 def unknown_centre_warning(view: Perspective, settings: Settings, known: KnownCamera | None) -> str | None:

@@ -65,6 +65,11 @@ MIN_TOTAL_GAIN = 10.0
 """Gain in log likelihood of all observations together required of perspective: few observations are weak evidence. Kass and Raftery
 (1995), Bayes factors, call 5 very strong."""
 
+UNCLEAR_GAINS = (MIN_PERSPECTIVE_GAIN / 4, 1.5 * MIN_PERSPECTIVE_GAIN)
+"""Gains, per point and frame, with which neither orthography nor perspective is clearly the better model. Of 57 solves of
+`benchmarks.accuracy.kinds`, 12 without an isometric surface have such gains, and errors of .098 to .57; so have three films of bending
+bodies, with .21 to .42. A rendered film of a face that is solved well gains .038."""
+
 COMPARED_RATIO = 1.6
 """Factor between a given focal length and the longer and shorter ones that it is compared with."""
 
@@ -285,6 +290,36 @@ def _decided(view: Perspective, trials: dict[float, _Trial], frames: int, points
         bend = max(_parabola(*found)[1], 1e-12)
         std = float(1 / np.sqrt(bend * frames * min(points, 1 / CAMERA_PRIOR_WEIGHT)))
     return replace(view, curvature=best, curvature_std=std, candidates=candidates, settled=settled)
+
+
+def more_probable(view: Perspective) -> tuple[float, float] | None:
+    """Return κ and gain of what is clearly more probable than the given focal length, 0 for orthography; None if nothing is.
+
+    The gain is infinite if the depths diverge with the given focal length.
+    """
+    if view.given is None:
+        return None
+    nll = {each.curvature: each.nll for each in view.candidates}
+    own = min((nll[each] for each in (view.given, -view.given) if each in nll), default=np.inf)
+    best = min(nll, key=lambda each: nll[each], default=0.0)
+    if not np.isfinite(own) or own - nll.get(best, np.inf) <= MIN_PERSPECTIVE_GAIN:
+        return None
+    return best, own - nll[best] if own < UNLIKELY else np.inf
+
+
+def unclear_perspective(view: Perspective) -> tuple[float, float] | None:
+    """Return κ and gain of the best perspective compared, if the tracks hardly distinguish it from orthography; None if they do.
+
+    Values of κ below the smallest of the grid, where perspective makes no difference, do not count. Nor does a given focal length or
+    camera model, about which the tracks were not asked.
+    """
+    nll = {each.curvature: each.nll for each in view.candidates if abs(each.curvature) >= CURVATURES[0]}
+    flat = next((each.nll for each in view.candidates if each.curvature == 0), None)
+    if view.given is not None or view.required or flat is None or not nll:
+        return None
+    best = min(nll, key=lambda each: nll[each])
+    gain = flat - nll[best]
+    return (best, gain) if UNCLEAR_GAINS[0] < gain < UNCLEAR_GAINS[1] else None
 
 
 def refined_with_focal(

@@ -8,12 +8,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.cameras.planar_ambiguity import is_planar, on_one_line
 from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.evaluation.trust import Trust, assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.pulse import pulse
 from pliant.solver.records import Camera, Floats, Tracks, read_only
+from pliant.solver.refinement.focal_length import MIN_PERSPECTIVE_GAIN, more_probable, unclear_perspective
 from pliant.solver.shapes.held_out import held_out_error
 from pliant.solver.shapes.jackknife import Changes, learning_changes
 from pliant.solver.shapes.uncertainty import Pinhole, bounded_by_neighbours, position_std
@@ -108,7 +110,8 @@ def assessed(
         read_only(std)
     tick()
     solution = replace(solution, shapes_std=std)
-    return replace(solution, trust=judged(solution, tracks, confidence, estimate, covariance, held_out_error=held_out))
+    trust = judged(solution, tracks, confidence, estimate, covariance, unit, held_out_error=held_out)
+    return replace(solution, trust=trust)
 
 
 def with_size_std(std: Floats, shapes: Floats, *, centred: bool) -> None:
@@ -137,6 +140,7 @@ def judged(
     confidence: Floats,
     estimate: CameraEstimate,
     covariance: ShapeCovariance | None,
+    unit: float,
     *,
     held_out_error: float | None,
 ) -> Trust:
@@ -155,6 +159,25 @@ def judged(
         depth_is_typical=estimate.depth_is_typical,
         shown=informative_frames(confidence),
         behind=frames_behind(solution.camera, solution.shapes),
+        unclear_camera=_unclear_camera(estimate.perspective, unit),
+    )
+
+
+def _unclear_camera(view: Perspective | None, unit: float) -> str | None:
+    """Return a sentence if the tracks contradict the given focal length, or hardly distinguish perspective from orthography.
+
+    `unit` is the tracks' unit per normalized unit.
+    """
+    if view is not None and more_probable(view) is not None:
+        return "The tracks contradict the given focal length. Check it, and solve without it to compare."
+    found = None if view is None else unclear_perspective(view)
+    if view is None or found is None:
+        return None
+    curvature, gain = found
+    other = "scaled_orthographic" if view.bends else "perspective"
+    return (
+        f"Whether the tracks show perspective is unclear: a focal length of {unit / abs(curvature):.4g} gains {gain:.3f} in the log "
+        f"likelihood per point and frame, and {MIN_PERSPECTIVE_GAIN} is required. Give the focal length, or compare with camera={other}."
     )
 
 

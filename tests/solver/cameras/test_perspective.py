@@ -36,7 +36,7 @@ from pliant.solver.model.marginal_likelihood import UNLIKELY
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
 from pliant.solver.reconstruction.camera_report import described, improbable, with_camera_choice
-from pliant.solver.refinement.focal_length import corrected_energy
+from pliant.solver.refinement.focal_length import corrected_energy, unclear_perspective
 from pliant.solver.refinement.learned import Learned, motion_of
 from pliant.solver.shapes import perspective_shapes
 from pliant.solver.tracks import completion
@@ -256,6 +256,8 @@ def test_a_wrong_focal_length_is_used_and_reported_as_improbable() -> None:
     )
     assert found.camera.focal == pytest.approx(3 * FOCAL)
     assert any("improbable" in warning for warning in found.choices.warnings)
+    assert found.trust is not None
+    assert "The tracks contradict the given focal length." in " ".join(found.trust.reasons)
 
 
 def test_a_field_of_view_is_a_focal_length() -> None:
@@ -394,6 +396,26 @@ def test_the_reported_gain_is_that_of_the_given_focal_length() -> None:
     assert "gains 0.100 in" in described(view, 100.0)
     assert "gains 0.400 in" in str(improbable(view, 100.0))
     assert improbable(replace(view, candidates=candidates[:1]), 100.0) is None  # stopped before its own was compared
+
+
+@pytest.mark.parametrize(
+    ("nll", "unclear"),
+    [
+        ({0.06: -0.01, -0.1: 0.0}, (0.06, 0.01)),
+        ({0.06: -0.004}, None),  # clearly orthographic
+        ({0.06: -0.031}, None),  # clearly perspective
+        ({0.01: -0.01, 0.06: 0.02}, None),  # a curvature that makes no difference
+    ],
+)
+def test_gains_near_the_limit_leave_the_camera_model_unclear(
+    nll: dict[float, float], unclear: tuple[float, float] | None
+) -> None:
+    candidates = tuple(Candidate(each, nll[each]) for each in nll)
+    view = Perspective(np.zeros((8, 2)), CENTRE, candidates=(Candidate(0.0, 0.0), *candidates))
+    assert unclear_perspective(view) == unclear
+    assert unclear_perspective(replace(view, required=True)) is None
+    assert unclear_perspective(replace(view, given=0.1)) is None
+    assert unclear_perspective(replace(view, candidates=candidates)) is None  # stopped before orthography was compared
 
 
 def test_an_unknown_picture_centre_is_a_warning_where_perspective_is_found() -> None:
