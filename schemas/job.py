@@ -198,10 +198,12 @@ class Inspection(Interpretation):
 
     sample: list[list[int]] = Field(
         default_factory=list,
+        repr=False,
         description="Some points in some frames, for a picture: x and y in turn, 0 to 1000, y down; -1 twice where hidden.",
     )
     first_frame: str | None = Field(
         None,
+        repr=False,
         description="First frame of a film, for a picture: a JPEG in base64, at most 800 pixels a side; `image_size` states the film's own "
         "pixels. Null for tracks.",
         json_schema_extra={"contentEncoding": "base64", "contentMediaType": "image/jpeg"},

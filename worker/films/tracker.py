@@ -233,7 +233,7 @@ def described(facts: FilmFacts, options: Options) -> Interpretation:
         has_ground_truth=False, has_rotations=False, layout="tracks (F, P, 2)", format=f"film ({facts.container})",
         given_frames=facts.stated_frames or None, image_size=f"{facts.width}x{facts.height}", fps=facts.fps,
         notes=[f"A film of {facts.width}×{facts.height} pixels, {count}, {options.fps:.3g} frames per second. "
-               "Its points are tracked when the job runs.", *notes_on_rate(facts.container),
+               "Its points are not tracked yet.", *notes_on_rate(facts.container),
                *notes_on_options(options, film=True)],
     )  # fmt: skip
 

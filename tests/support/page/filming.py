@@ -76,7 +76,7 @@ def film_record(url: str, finished: str, **fields: Any) -> dict[str, Any]:
     """Return the record of a running film job, derived from that of a finished job."""
     record = httpx.get(f"{url}/v1/jobs/{finished}").json()
     read = {"num_frames": 6, "num_points": 0, "num_faces": 0, "mesh_source": "film", "format": "film (webm)"}
-    notes = ["A film of 320×240 pixels, 6 frames, 5 frames per second. Its points are tracked when the job runs."]
+    notes = ["A film of 320×240 pixels, 6 frames, 5 frames per second. Its points are not tracked yet."]
     record["interpretation"] |= {**read, "notes": notes, "has_ground_truth": False}
     progress = {"stage": "track", "fraction": 0.2, "updated_at": record["finished_at"], "seconds_left": 30.0}
     progress |= {"reweighting": 0, "max_reweightings": 0, "objective": None, "residual": None}
