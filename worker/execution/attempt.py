@@ -77,11 +77,11 @@ def _conclude(attempt: Attempt, stored: Stored, *, worker: str, settings: Settin
     attempt.log(f"Attempt {stored.job.attempt} began on worker {worker}.")
     with contextlib.ExitStack() as stack:
         try:
-            directory.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(_own_output(directory / OUTPUT))
-        except OSError as error:
-            return attempt.conclude(attempt.failed(error))
-        try:
+            try:
+                directory.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(_own_output(directory / OUTPUT))
+            except OSError as error:
+                return attempt.conclude(attempt.failed(error))
             with _limited_memory(settings.memory_limit):
                 end = work(attempt, stored, directory)
             return attempt.conclude(end)
