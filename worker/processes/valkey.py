@@ -80,7 +80,7 @@ class Valkey:
         DataDirectoryInUse
             Another supervisor uses the directory, or its server does not stop.
         ServerFailed
-            There is no server binary.
+            There is no server binary, or other users can write to the socket's directory.
         """
         binary = find_binary()
         home, path = valkey_directory(data), socket_path(data)
@@ -100,6 +100,12 @@ class Valkey:
                 os.close(lock)
                 os.close(supervisor_lock)
                 raise DataDirectoryInUse(str(data), holder="a Valkey server that does not stop")
+        try:
+            _make_private(path.parent)
+        except ServerFailed:
+            os.close(lock)
+            os.close(supervisor_lock)
+            raise
         return cls(data, _command(binary, home, path), lock, supervisor_lock)
 
     def wait(self, process: subprocess.Popen[bytes]) -> None:
@@ -125,9 +131,8 @@ class Valkey:
         Raises
         ------
         ServerFailed
-            The server exited or did not answer in time, or other users can write to the socket's directory.
+            The server exited or did not answer in time.
         """
-        _make_private(socket_path(self.data).parent)
         process = subprocess.Popen(self.argv, pass_fds=(self.server_lock,), start_new_session=True)  # noqa: S603
         try:
             self.wait(process)

@@ -268,10 +268,10 @@ def test_a_socket_directory_that_others_may_write_is_refused(tmp_path: Path) -> 
     directory.mkdir(mode=0o700)
     try:
         directory.chmod(0o777)
-        valkey = Valkey.claim(deep)
         with pytest.raises(ServerFailed, match="is writable by other users"):
-            valkey.start()
+            Valkey.claim(deep)
         directory.chmod(0o700)
+        valkey = Valkey.claim(deep)
         server = valkey.start()
         server.terminate()
         server.wait(10)
@@ -298,10 +298,8 @@ def test_a_socket_directory_that_is_a_link_is_refused(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     directory.symlink_to(tmp_path / "elsewhere")
     try:
-        valkey = Valkey.claim(deep)
         with pytest.raises(ServerFailed, match="is writable by other users"):
-            valkey.start()
-        valkey.release()
+            Valkey.claim(deep)
     finally:
         directory.unlink()
 
