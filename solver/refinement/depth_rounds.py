@@ -19,7 +19,7 @@ from pliant.solver.refinement.bas_relief import LOG_DEPTH_STD
 from pliant.solver.refinement.depth_alternation import alternated, factorized_again
 from pliant.solver.refinement.focal_length import search
 from pliant.solver.refinement.learned import Learned, stretched
-from pliant.solver.tracks.completion import often_visible
+from pliant.solver.tracks.completion import briefly_hidden
 from pliant.solver.tracks.normalization import Normalized
 
 RESTARTS = 3
@@ -58,8 +58,8 @@ def settled(
     """
     assert estimate.perspective is not None
     whole = estimate.sample + (estimate.perspective.offsets + estimate.translations)[:, None]
-    often = often_visible(normalized.visible)[estimate.sampled]
-    view = replace(estimate.perspective, filling=estimate.filling, sample=whole[:, often], whole=whole)
+    briefly = briefly_hidden(normalized.visible)[estimate.sampled]
+    view = replace(estimate.perspective, filling=estimate.filling, sample=whole[:, briefly], whole=whole)
     rotations, scales = np.asarray(estimate.rotations), np.asarray(estimate.scales)
     view, found = search(
         view.sample[used], rotations[used], scales[used], view,

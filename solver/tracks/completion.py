@@ -57,6 +57,11 @@ DAMPING = 1e-2
 COEFFICIENT_RIDGE = 1e-6
 """Ridge relative to the mean diagonal; keeps the coefficients of sparsely observed points determined."""
 
+LONGEST_GAP = 0.1
+"""Longest time for which a point may be hidden if perspective is looked for in its completed track, share of the frames. With .05, two
+films of a fish and a hand have focal lengths of .94 and 1.12 of the true ones, with .1 .99 and 1.13, with half of the frames in all 2.8
+and 1.19."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Filling:
@@ -164,6 +169,28 @@ def often_visible(visible: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
         if shown.any():
             often |= shown & (count >= min(len(seen) / 2, float(np.median(count[shown]))))
     return np.asarray(often & (count >= min(2, int(count.max()))))
+
+
+def briefly_hidden(visible: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
+    """Return a mask of the points whose completed tracks perspective is looked for in, shape `(P,)`.
+
+    Where a point is hidden for long, its completed track follows an orthographic model, which explains perspective away. A tracker loses
+    the parts that move most; in a film of a fish it kept the tail in half of the frames, and the focal length was 2.8 times too long.
+
+    A point is used if it is hidden for at most `LONGEST_GAP` of the frames at a time, or for no longer than the median point that some
+    frame shows.
+    """
+    seen = visible > 0
+    gaps, gap = np.zeros(seen.shape[1], dtype=np.intp), np.zeros(seen.shape[1], dtype=np.intp)
+    for shown in seen:
+        gap = np.where(shown, 0, gap + 1)
+        np.maximum(gaps, gap, out=gaps)
+    used = np.zeros(len(gaps), dtype=bool)
+    for shown in seen:
+        if shown.any():
+            used |= shown & (gaps <= max(LONGEST_GAP * len(seen), float(np.median(gaps[shown]))))
+    count = seen.sum(axis=0)
+    return np.asarray(used & (count >= min(2, int(count.max()))))
 
 
 def ranks(points: Floats) -> NDArray[np.intp]:

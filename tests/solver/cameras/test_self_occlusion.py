@@ -7,7 +7,7 @@ import pytest
 from pliant.solver import Settings, Tracks, solve
 from pliant.solver.evaluation.metrics import e3d_frame_scaled
 from pliant.solver.records import Floats
-from pliant.solver.tracks.completion import often_visible
+from pliant.solver.tracks.completion import briefly_hidden, often_visible
 
 PICTURE = (1280.0, 720.0)
 FOCAL = 1200.0
@@ -68,3 +68,28 @@ def test_short_tracks_keep_half_of_the_points_of_every_frame() -> None:
     assert not often.all()
     assert often_visible(np.ones((5, 6))).all()
     assert not often_visible(np.zeros((5, 6))).any()
+
+
+def test_perspective_is_looked_for_in_points_that_are_never_hidden_for_long() -> None:
+    visible = np.ones((40, 12))
+    visible[::2, 1] = 0.0  # every second frame: completion interpolates it well
+    visible[10:14, 2] = 0.0
+    visible[10:15, 3] = 0.0
+    visible[:5, 4] = 0.0  # it begins late
+    visible[35:, 5] = 0.0
+    visible[:, 6] = 0.0
+    visible[:, 7] *= 0.3
+    assert np.flatnonzero(~briefly_hidden(visible)).tolist() == [3, 4, 5, 6]
+
+
+def test_if_most_points_are_hidden_for_long_half_of_every_frame_is_used() -> None:
+    random = np.random.default_rng(0)
+    visible = np.zeros((100, 60))
+    for column in visible.T:
+        first = random.integers(0, 90)
+        column[first : first + random.integers(3, 30)] = 1
+    used, shown = briefly_hidden(visible), (visible > 0).sum(axis=1)
+    assert ((visible > 0)[:, used].sum(axis=1) >= shown / 2).all()
+    assert not used.all()
+    assert briefly_hidden(np.ones((5, 6))).all()
+    assert not briefly_hidden(np.zeros((5, 6))).any()
