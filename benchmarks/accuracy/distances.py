@@ -1,11 +1,13 @@
 """Error against camera distance: sequences with known cameras, projected with a pinhole camera.
 
-    python -m benchmarks.accuracy.distances --data DIR [--only NAME] [--points N] [--spoil KINDS] [--travel T] [--out FILE]
+    python -m benchmarks.accuracy.distances --data DIR [--only NAME] [--points N] [--spoil KINDS] [--travel T]
+        [--jitter PX] [--out FILE]
 
 The true shapes, in camera axes, are scaled to a half-size (largest |coordinate|) of 300 px and projected from d half-sizes away into a
 picture of 1280 × 720 px: u = c + x/(1 + z/φ) with φ = 300·d px and c the centre. All points are visible; the solver is given `image_size`
 but not φ. Distance `inf` means orthography. `--spoil noise,drift,births,outliers,hidden,all` adds tracker errors
-(`benchmarks.accuracy.spoiling`), one kind at a time. `--travel T` moves the object by T half-sizes from left to right. Each metric is
+(`benchmarks.accuracy.spoiling`), one kind at a time. `--travel T` moves the object by T half-sizes from left to right;
+`--jitter PX` adds noise, which shows how far errors of exact tracks depend on the optimum that is found. Each metric is
 appended to FILE as one JSON line {method, sequence, metric, value, trial, distance, seconds}; finished measurements are not repeated.
 """
 
@@ -69,9 +71,14 @@ def mirrored(shapes: np.ndarray, truth: np.ndarray) -> bool:
     return float((sign * values[:, 2]).sum()) < 0
 
 
-def measure(case: Case, distance: str, method: str, *, spoil: str = "clean", travel: float = 0.0) -> dict[str, float]:
-    """Solve one case and return its metrics; `spoil` names one of `SPOILINGS`."""
+def measure(
+    case: Case, distance: str, method: str, *, spoil: str = "clean", travel: float = 0.0, jitter: float = 0.0
+) -> dict[str, float]:
+    """Solve one case and return its metrics; `spoil` names one of `SPOILINGS`, `jitter` is in pixels."""
     tracks, shapes, rotations = seen_from(case, float(distance), travel=travel)
+    if jitter:
+        noise = jitter * np.random.default_rng(1).normal(size=tracks.points.shape)
+        tracks = Tracks.from_arrays(tracks.points + noise)
     tracks = spoiled(tracks, SPOILINGS[spoil])
     began = time.perf_counter()
     solution = solve(tracks, case.mesh, settings=Settings(camera=CAMERAS[method], image_size=PICTURE))  # type: ignore[arg-type]
@@ -93,6 +100,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--travel", type=float, default=0.0, help="half-sizes that the object moves through the picture"
     )
+    parser.add_argument("--jitter", type=float, default=0.0, help="standard deviation of added noise, px")
     given = parser.parse_args(arguments)
     done = {(row["sequence"], row["distance"], row["method"]) for row in rows(given.out)}
     given.out.parent.mkdir(parents=True, exist_ok=True)
@@ -107,9 +115,10 @@ def main(arguments: list[str] | None = None) -> None:
         for spoil, distance, method in kinds:
             name = f"{case.name} P={case.tracks.num_points}" + ("" if spoil == "clean" else f" {spoil}")
             name += f" travel {given.travel:g}" if given.travel else ""
+            name += f" jitter {given.jitter:g}" if given.jitter else ""
             if (name, distance, method) in done:
                 continue
-            values = measure(case, distance, method, spoil=spoil, travel=given.travel)
+            values = measure(case, distance, method, spoil=spoil, travel=given.travel, jitter=given.jitter)
             _keep(given.out, name, distance, method, values)
             print(
                 f"{name:26} {distance:>4} {method:14} {values['e3d_frame_scaled']:8.4f} {values['e3d_frame_similarity']:8.4f} "

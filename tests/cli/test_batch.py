@@ -60,7 +60,7 @@ def test_a_folder_a_pattern_or_a_list_submits_one_job_per_file(run: Run, takes: 
     assert len(jobs_of(run)) == 3, "the second and third command found the jobs of the first"
 
 
-def test_a_job_that_was_cancelled_is_submitted_again(service: InMemoryService, takes: Path) -> None:
+def test_a_job_that_was_cancelled_is_submitted_again(takes: Path) -> None:
     files = [str(takes / f"take-{number}.npz") for number in (0, 1)]
     slow = InMemoryService(steps=1000)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from functools import partial
 from pathlib import Path
 
 import films
@@ -111,9 +110,8 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
     assert "warning Only 5 frames are tracked." in words
     assert "warning" not in inspect(film, "-O", "region_polygon=[[20,20],[70,20],[70,55]]").output
     assert "note Not used for films: layout." in " ".join(inspect(film, "-O", "layout=points_frames").output.split())
-    for command in (inspect, partial(solve, film, "-o", tmp_path / "out")):
-        arguments = ("-O", "focal=500", "-O", "field_of_view=60")
-        refused = command(film, *arguments) if command is inspect else command(*arguments)
+    contradiction = ("-O", "focal=500", "-O", "field_of_view=60")
+    for refused in (inspect(film, *contradiction), solve(film, "-o", tmp_path / "out", *contradiction)):
         assert refused.exit_code == Exit.REFUSED
         assert "field_of_view" in refused.output
         assert "tracking" not in refused.output

@@ -43,9 +43,9 @@ from pliant.worker.films.tracker import (
     Tracked,
     believed_size,
     believed_warnings,
-    check_film,
     described,
     film_options,
+    read_film,
     track_film,
 )
 from pliant.worker.formats import Inputs
@@ -74,12 +74,12 @@ def region(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def refusal(source: FilmSource, options: Options = Options(), bounds: FilmBounds = FilmBounds()) -> InvalidInput:  # noqa: B008
     with pytest.raises(InvalidInput) as refused:
-        check_film(source, options, bounds)
+        read_film(source, options, bounds)
     return refused.value
 
 
 def test_a_film_is_checked_without_being_tracked(film: Path, region: Path) -> None:
-    facts = check_film(FilmSource(film, region), Options(frames="2:10:2"))
+    facts = read_film(FilmSource(film, region), Options(frames="2:10:2")).facts
     assert (facts.container, facts.width, facts.height, facts.fps) == ("matroska", *SIZE, 15.0)
     options = film_options(Options(), facts)
     assert (options.image_size, options.fps) == ("96x72", 15.0)
@@ -90,7 +90,7 @@ def test_a_film_is_checked_without_being_tracked(film: Path, region: Path) -> No
 
 
 def test_a_film_has_its_own_size_and_no_use_for_options_of_tracks(film: Path) -> None:
-    facts = check_film(FilmSource(film), Options())
+    facts = read_film(FilmSource(film), Options()).facts
     assert film_options(Options(image_size="96x72"), facts).image_size == "96x72"
     with pytest.raises(InvalidInput) as refused:
         film_options(Options(image_size="192x144"), facts)
@@ -105,18 +105,18 @@ def test_the_rate_of_pictures_is_said_to_be_assumed(tmp_path: Path) -> None:
     pictures = films.zip_of(
         tmp_path / "pictures.zip", {f"{place}.png": films.png(each) for place, each in enumerate(textured)}
     )
-    facts = check_film(FilmSource(pictures), Options())
+    facts = read_film(FilmSource(pictures), Options()).facts
     sentence = "Pictures state no frame rate: unless the option fps is given, 30 frames per second are assumed."
     assert facts.fps == 30
     assert sentence in described(facts, film_options(Options(), facts)).notes
     film = films.write_film(tmp_path / "film.mp4", films.textured_pictures(6, SIZE))
-    assert sentence not in described(check_film(FilmSource(film), Options()), Options()).notes
+    assert sentence not in described(read_film(FilmSource(film), Options()).facts, Options()).notes
 
 
 def test_the_first_frame_of_the_whole_film_is_returned_on_request(film: Path, tmp_path: Path) -> None:
-    assert check_film(FilmSource(film), Options()).first_frame == ""
+    assert read_film(FilmSource(film), Options()).facts.first_frame == ""
     for frames in ("", "4:10"):
-        facts = check_film(FilmSource(film), Options(frames=frames) if frames else Options(), picture=True)
+        facts = read_film(FilmSource(film), Options(frames=frames) if frames else Options(), picture=True).facts
         with Image.open(io.BytesIO(base64.b64decode(facts.first_frame))) as picture:
             assert (picture.format, picture.size) == ("JPEG", SIZE)
             shown = np.asarray(picture, float)
@@ -124,7 +124,7 @@ def test_the_first_frame_of_the_whole_film_is_returned_on_request(film: Path, tm
         assert np.argmin(differences) == 0
     large = np.full((900, 1200, 3), 128, np.uint8)
     pictures = films.zip_of(tmp_path / "large.zip", {f"{number}.png": films.png(large) for number in range(3)})
-    facts = check_film(FilmSource(pictures), Options(), picture=True)
+    facts = read_film(FilmSource(pictures), Options(), picture=True).facts
     with Image.open(io.BytesIO(base64.b64decode(facts.first_frame))) as picture:
         assert picture.size == (800, 600)
     assert (facts.width, facts.height) == (1200, 900)
@@ -133,7 +133,7 @@ def test_the_first_frame_of_the_whole_film_is_returned_on_request(film: Path, tm
 def test_an_incompressible_first_frame_fits_the_answer(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (900, 900, 3), dtype=np.uint8)
     pictures = films.zip_of(tmp_path / "noise.zip", {f"{number}.png": films.png(noise) for number in range(3)})
-    assert len(check_film(FilmSource(pictures), Options(), picture=True).first_frame) < MAX_ANSWER / 1.5
+    assert len(read_film(FilmSource(pictures), Options(), picture=True).facts.first_frame) < MAX_ANSWER / 1.5
 
 
 def test_film_limits_come_from_the_settings(film: Path) -> None:
@@ -149,7 +149,7 @@ def test_film_limits_come_from_the_settings(film: Path) -> None:
 
 def test_a_portrait_film_is_upright(tmp_path: Path) -> None:
     path = films.turned_by_90(films.write_film(tmp_path / "film.mp4", films.textured_pictures(6, SIZE)))
-    facts = check_film(FilmSource(path), Options())
+    facts = read_film(FilmSource(path), Options()).facts
     assert (facts.width, facts.height, facts.frames) == (72, 96, 6)
 
 
@@ -242,7 +242,7 @@ def test_each_exit_of_the_film_process_maps_to_an_error() -> None:
 
 def test_a_film_and_its_region_are_stored_byte_for_byte(film: Path, region: Path, tmp_path: Path) -> None:
     source = FilmSource(film, region)
-    facts = check_film(source, Options())
+    facts = read_film(source, Options()).facts
     save_source(source, described(facts, Options()), tmp_path / "inputs.npz")
     assert is_source(tmp_path / "inputs.npz")
     back = open_source(tmp_path / "inputs.npz", tmp_path / "back")
@@ -299,7 +299,7 @@ def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Pa
     steps: list[Progress] = []
     (tmp_path / "scratch").mkdir()
     options = Options(outputs=(), max_reweightings=2, grid_step=6, refine_rotations=False, principal_point="60,30")
-    options = film_options(options, check_film(FilmSource(film, region), options))
+    options = film_options(options, read_film(FilmSource(film, region), options).facts)
     done = reconstruct_film(
         FilmSource(film, region), options, tmp_path / "out", scratch=tmp_path / "scratch", on_progress=steps.append
     )

@@ -11,7 +11,7 @@ import pytest
 from pliant.schemas.options import Options
 from pliant.worker.execution.film import reconstruct_film
 from pliant.worker.films.sources import FilmSource, open_source, save_source
-from pliant.worker.films.tracker import check_film, described, film_options
+from pliant.worker.films.tracker import described, film_options, read_film
 from pliant.worker.jobs.finished import Finished
 
 QUICK = {"outputs": (), "prior": "smooth", "max_reweightings": 1, "grid_step": 8, "refine_rotations": False,
@@ -32,7 +32,7 @@ def solved(film: Path, folder: Path, *, fps: float | None) -> tuple[Finished, di
     """Reconstruct a film as a job does; return the result, the options in its report, and the rate in its tracks."""
     given = Options(**QUICK) if fps is None else Options(**QUICK, fps=fps)
     source = FilmSource(film, own_rate="fps" in given.model_fields_set)
-    options = film_options(given, check_film(source, given))
+    options = film_options(given, read_film(source, given).facts)
     (folder / "scratch").mkdir()
     done = reconstruct_film(source, options, folder / "out", scratch=folder / "scratch")
     report = json.loads((folder / "out" / "report.json").read_text())
@@ -43,7 +43,7 @@ def solved(film: Path, folder: Path, *, fps: float | None) -> tuple[Finished, di
 @pytest.mark.slow
 def test_the_rate_is_that_of_the_tracked_frames(uneven: Path, tmp_path: Path) -> None:
     done, reported, rate = solved(uneven, tmp_path, fps=None)
-    stated = check_film(FilmSource(uneven), Options()).fps
+    stated = read_film(FilmSource(uneven), Options()).facts.fps
     assert abs(rate - stated) > 0.5, "the file states another rate than its frames have"
     assert done.options is not None
     assert done.interpretation is not None
@@ -53,7 +53,7 @@ def test_the_rate_is_that_of_the_tracked_frames(uneven: Path, tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_a_rate_that_the_job_sets_is_kept_even_if_the_file_states_the_same(uneven: Path, tmp_path: Path) -> None:
-    stated = check_film(FilmSource(uneven), Options()).fps
+    stated = read_film(FilmSource(uneven), Options()).facts.fps
     done, reported, rate = solved(uneven, tmp_path, fps=stated)
     assert done.options is not None
     assert reported["fps"] == done.options.fps == stated != rate
@@ -62,5 +62,5 @@ def test_a_rate_that_the_job_sets_is_kept_even_if_the_file_states_the_same(uneve
 @pytest.mark.parametrize("own", [True, False])
 def test_a_stored_film_keeps_whether_the_job_sets_the_rate(uneven: Path, tmp_path: Path, own: bool) -> None:
     source = FilmSource(uneven, own_rate=own)
-    save_source(source, described(check_film(source, Options()), Options()), tmp_path / "inputs.npz")
+    save_source(source, described(read_film(source, Options()).facts, Options()), tmp_path / "inputs.npz")
     assert open_source(tmp_path / "inputs.npz", tmp_path / "back").own_rate is own

@@ -109,7 +109,10 @@ def _size_sentence(scales: Floats) -> str:
     change = round(100 * (float(scales.max() / scales.min()) - 1))
     if change < 1:
         return ""
-    return f" Its distance changes by {change} %; an object that grows or shrinks would look the same."
+    return (
+        f" The object's size in the picture changes by {change} %, which is taken as a change of the camera's distance; an object that "
+        "grows or shrinks would look the same."
+    )
 
 
 def _trust(trust: Trust | None) -> dict[str, Any]:

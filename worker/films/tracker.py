@@ -82,32 +82,6 @@ class Tracked(BaseModel):
     warnings: Warnings
 
 
-def check_film(
-    source: FilmSource,
-    options: Options,
-    bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
-    *,
-    estimate: bool = False,
-    picture: bool = False,
-    threads: int = 1,
-) -> FilmFacts:
-    """Open a film and its region without tracking it; takes seconds, regardless of the film's length.
-
-    `estimate` adds the expected number of points and the tracking time on `threads` threads; `picture` adds the first frame.
-
-    Raises
-    ------
-    InvalidInput
-        Not a film, a limit is exceeded, or a region or option does not fit the film.
-    """
-    _check_region(source, options)
-    with TemporaryDirectory(prefix="pliant-film-") as scratch:
-        ended = _run(
-            "check", source, options, bounds, Path(scratch), threads=threads, estimate=estimate, picture=picture
-        )
-    return _answer(FilmFacts, ended, bounds, bounds.check_seconds)
-
-
 OnWarnings = Callable[[tuple[str, ...]], None]
 OnProgress = Callable[[float, tuple[int, int] | None, FollowedPoints | None], None]
 
@@ -207,14 +181,21 @@ def read_film(
     picture: bool = False,
     threads: int = 1,
 ) -> ReadFilm:
-    """Check a film and all options of its job without tracking it. Parameters are those of `check_film`.
+    """Open a film and its region, and check all options of its job, without tracking it; takes seconds, regardless of the film's length.
+
+    `estimate` adds the expected number of points and the tracking time on `threads` threads; `picture` adds the first frame.
 
     Raises
     ------
     InvalidInput
-        The film or its region cannot be used, or an option does not fit them or another option.
+        Not a film, a limit is exceeded, or an option does not fit the film, its region or another option.
     """
-    facts = check_film(source, options, bounds, estimate=estimate, picture=picture, threads=threads)
+    _check_region(source, options)
+    with TemporaryDirectory(prefix="pliant-film-") as scratch:
+        ended = _run(
+            "check", source, options, bounds, Path(scratch), threads=threads, estimate=estimate, picture=picture
+        )
+    facts = _answer(FilmFacts, ended, bounds, bounds.check_seconds)
     options = film_options(options, facts)
     solver_settings(options)
     interpretation = described(facts, options)

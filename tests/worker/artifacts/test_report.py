@@ -76,12 +76,13 @@ def test_the_report_states_the_field_of_view(focal: float | None, std: float | N
     [
         (
             1.34,
-            "Scaled orthographic camera. Its distance changes by 34 %; an object that grows or shrinks would look the same.",
+            "Scaled orthographic camera. The object's size in the picture changes by 34 %, which is taken as a change of the camera's "
+            "distance; an object that grows or shrinks would look the same.",
         ),
         (1.004, "Scaled orthographic camera."),
     ],
 )
-def test_the_report_states_how_much_the_distance_of_the_camera_changes(farthest: float, sentence: str) -> None:
+def test_the_report_states_how_much_the_size_in_the_picture_changes(farthest: float, sentence: str) -> None:
     inputs, solution, options = make_result()
     scales = np.linspace(1, farthest, len(solution.camera.scales))[::-1] * 2
     solution = replace(

@@ -11,7 +11,7 @@ from crafting import CANARY, HONEST
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.worker.films.sources import FilmSource
-from pliant.worker.films.tracker import FilmBounds, check_film
+from pliant.worker.films.tracker import FilmBounds, read_film
 from pliant.worker.formats import store_inputs
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("forked_readers")]
@@ -26,7 +26,7 @@ def test_a_crafted_file_is_refused_by_its_reader(attack: Attack, tmp_path: Path)
     given: dict[str, Path | str] = {"tracks": honest, **attack.texts, attack.part: crafted}
     given.pop("options", None)
     read = (
-        partial(check_film, FilmSource(crafted, None), options, FilmBounds(max_bytes=attack.limits.max_bytes))
+        partial(read_film, FilmSource(crafted, None), options, FilmBounds(max_bytes=attack.limits.max_bytes))
         if attack.part == "film"
         else partial(store_inputs, **given, options=options, limits=attack.limits, target=tmp_path / "inputs.npz")  # type: ignore[arg-type]
     )
