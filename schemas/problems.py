@@ -73,6 +73,7 @@ class ProblemCode(StrEnum):
     RANGE_NOT_SATISFIABLE = auto()
     UNKNOWN_HOST = auto()
     INVALID_REQUEST = auto()
+    UNKNOWN_PARAMETER = auto()
     UNKNOWN_PART = auto()
     REPEATED_PART = auto()
     MISSING_PART = auto()

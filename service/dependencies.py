@@ -6,8 +6,12 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 from fastapi import Depends, Request
+from fastapi.routing import APIRoute
+from pliant.schemas.problems import ProblemCode
+from pliant.schemas.suggestions import closest
 from pliant.service.event_stream import Followers
 from pliant.service.metrics import Metrics
+from pliant.service.problems import wrong_input
 from pliant.service.settings import ServiceSettings
 from pliant.service.spool import Incoming, ParserSlots
 from pliant.service.upload_locks import UploadLocks
@@ -41,6 +45,25 @@ def service_of(request: Request) -> Service:
     service = request.app.state.service
     assert isinstance(service, Service)
     return service
+
+
+async def known_parameters(request: Request) -> None:
+    """Refuse a query parameter that a route of the API does not have: a misspelled filter would have no effect."""
+    route = request.scope["route"]
+    assert isinstance(route, APIRoute)
+    if not route.path.startswith("/v1/"):  # monitoring systems and load balancers add parameters of their own
+        return
+    known = [field.alias for field in route.dependant.query_params]
+    for name in request.query_params:
+        if name not in known:
+            meant = closest(name, known)
+            raise wrong_input(
+                ProblemCode.UNKNOWN_PARAMETER,
+                field=name,
+                expected=f"one of {', '.join(sorted(known))}" if known else "no query parameters",
+                got=name,
+                hint=f"Did you mean `{meant}`?" if meant else "Omit it; the parameters of every path are at /docs.",
+            )
 
 
 @dataclass(frozen=True)

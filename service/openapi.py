@@ -250,6 +250,8 @@ def _complete(operation: dict[str, Any], path: str) -> None:
         usual |= _WITH_TOKEN
     if "{" in path:
         usual.add(404)
+    if path.startswith("/v1/"):
+        usual.add(422)  # an unknown query parameter
     for status in usual:
         responses.setdefault(str(status), _problem(status))
     operation["responses"] = dict(sorted(responses.items()))

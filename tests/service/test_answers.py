@@ -154,6 +154,26 @@ def test_allow_names_every_method_of_an_address(http: httpx.Client) -> None:
     assert allowed("POST", "/v1/jobs/abc/artifacts/shapes.npz") == "GET, HEAD"
 
 
+@pytest.mark.parametrize(
+    ("address", "field", "hint"),
+    [
+        ("/v1/jobs?stauts=failed", "stauts", "Did you mean `status`?"),
+        ("/v1/jobs?limit=1&page=2", "page", "Omit it"),
+        ("/v1/limits?verbose=1", "verbose", "Omit it"),
+    ],
+)
+def test_an_unknown_query_parameter_is_refused(http: httpx.Client, address: str, field: str, hint: str) -> None:
+    answer = http.get(address)
+    problem = answer.json()
+    assert (answer.status_code, problem["code"], problem["field"]) == (422, "unknown_parameter", field)
+    assert problem["hint"].startswith(hint)
+
+
+@pytest.mark.parametrize("address", ["/healthz?probe=1", "/readyz?exclude=workers&probe=1", "/metrics?format=text"])
+def test_addresses_for_machines_accept_any_query_parameter(http: httpx.Client, address: str) -> None:
+    assert http.get(address).status_code == 200
+
+
 def test_a_body_that_is_not_json_is_described(http: httpx.Client) -> None:
     job = submit(http)
     headers = {"Content-Type": "application/json"}

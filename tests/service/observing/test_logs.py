@@ -50,7 +50,7 @@ def test_rejections_are_logged_with_their_code_and_without_secrets(
     http.get("/v1/jobs/nobody-here?token=SECRET", headers={"Authorization": "Bearer SECRET"})
     until(lambda: any(vars(record).get("job") == "nobody-here" for record in lines(caplog)))
     (record,) = [record for record in lines(caplog) if vars(record).get("job") == "nobody-here"]
-    assert (record.levelname, vars(record)["code"]) == ("WARNING", "unknown_job")
+    assert (record.levelname, vars(record)["code"]) == ("WARNING", "unknown_parameter")
     ours = [record for record in caplog.records if record.name.startswith("pliant")]
     assert all("SECRET" not in str(vars(record)) for record in ours)
     http.get("/v1/jobs/a%0Ab%1B")
