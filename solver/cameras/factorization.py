@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.model.so3 import from_rows, start_at_identity
+from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats
 from scipy.optimize import minimize
 
@@ -155,6 +156,7 @@ def _orthonormality(flat: Floats, factor: Floats) -> tuple[float, Floats]:
     a, b, c are the entries of the 2×2 Gram matrix of Π_f G, and m is the mean of a + b. The value is invariant to the
     scale of G.
     """
+    pulse()
     corrective = flat.reshape(-1, 3)
     rows = factor @ corrective
     a, b = (rows[:, 0] ** 2).sum(axis=1), (rows[:, 1] ** 2).sum(axis=1)

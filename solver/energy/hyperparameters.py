@@ -146,7 +146,7 @@ def _from_covariance(covariance: ShapeCovariance, settings: Settings) -> tuple[W
 
 
 def bending_weight(temporal: float, laplacian: Laplacian, shapes: NDArray[np.floating], modes: int) -> float:
-    """Return λ2 that preserves about the bending of shapes `(F, 3, P)` found without it; `modes` is the number of prior modes."""
+    """Return λ2 that preserves about the bending of shapes `(F, 3, P)` found without it; `modes` counts the mean shape as well."""
     flat = shapes.reshape(-1, shapes.shape[2])
     bends = np.asarray(laplacian.matrix @ flat.T, dtype=np.float64)
     rows = float((np.diff(laplacian.matrix.indptr) > 0).mean())

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.inextensible import Indices
+from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats
 from pliant.solver.tracks.frame_selection import evenly_spread
 from scipy import sparse
@@ -224,6 +225,7 @@ def _fit_patches(points: Floats, seen: NDArray[np.bool_], patches: Indices) -> t
     noise = float(size)
     motion = np.zeros((len(patches), len(points), RANK + 1, 2))
     for sweep in range(SWEEPS):
+        pulse()
         basis = np.concatenate([shape, np.ones((*shape.shape[:2], 1))], axis=2)
         motion = _least_squares(np.einsum("nfq,nqa,nqb->nfab", weight, basis, basis, optimize=True),
                                 np.einsum("nfq,nqa,nfqc->nfac", weight, basis, image, optimize=True))  # fmt: skip

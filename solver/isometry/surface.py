@@ -132,7 +132,7 @@ def isometric_surface(
     Parameters
     ----------
     tracks : Tracks
-        Pixels, x right, y down.
+        Pixels, x right, y down. Every visible observation counts equally, whatever its confidence.
     focal : float, optional
         Focal length in pixels; None searches for it.
     principal_point : (x, y), optional

@@ -26,6 +26,7 @@ from math import inf, isfinite
 
 import numpy as np
 from pliant.solver.model.random_walk import WalkPosterior, random_walk
+from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats, read_only
 from scipy import linalg
 from scipy.linalg import lapack
@@ -173,6 +174,7 @@ class Explained:
         numpy.linalg.LinAlgError
             V is not positive definite to rounding, or not finite.
         """
+        pulse()
         frames, noise, columns = len(model.walk), model.noise_variance, model.columns
         walk = WalkPosterior.of(
             model.walk, noise_variance=noise, walk_variance=model.walk_variance, ordered=model.ordered
@@ -237,6 +239,7 @@ def inverted(matrix: Floats) -> tuple[Floats, float]:
     numpy.linalg.LinAlgError
         It is indefinite to rounding, or not finite.
     """
+    pulse()
     factor, failed = lapack.dpotrf(matrix, lower=1)
     log_det = inf if failed else 2 * float(np.log(factor.diagonal()).sum())
     if not isfinite(log_det):

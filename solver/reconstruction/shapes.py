@@ -51,7 +51,7 @@ def _minimised(start: Start, history: list[State], monitor: Monitor) -> tuple[St
     monitor.expect_corrections(corrections)
     history, outcome = _loop(start, history, monitor)
     for ahead in reversed(range(corrections)):
-        if outcome is Outcome.STOPPED:
+        if outcome in (Outcome.STOPPED, Outcome.MAX_REWEIGHTINGS):
             break
         monitor.expect_corrections(ahead)
         problem, flat, changed = corrected_again(

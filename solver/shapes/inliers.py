@@ -115,7 +115,7 @@ def inlier_probability(
     for some in frame_chunks(*used.shape):
         chosen = used[some]
         logs = _log_density(left[some][chosen] / scale, confidence[some][chosen], loss)
-        found[some][chosen] = expit(logs + np.log(area) + np.log(odds))
+        found[some][chosen] = np.maximum(expit(logs + np.log(area) + np.log(odds)), np.finfo(np.float64).tiny)
     return found
 
 

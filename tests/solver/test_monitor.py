@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pliant.solver import KnownCamera, Outcome, Settings, Step, Tracks, gallery, solve
+from pliant.solver.cameras.factorization import refine_factor
 from pliant.solver.descent import Descent, expected_iterations, steps_left
+from pliant.solver.model import expectation_maximisation
 from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import pulse, pulses_to
 from pliant.solver.stages import Pace, Stage, planned, unseen_frames
@@ -152,6 +154,28 @@ def test_pulses_are_reported_after_a_silence_and_count_no_work() -> None:
     pulse()
     assert len(steps) == 5
     assert {step.fraction for step in steps} == {0.0}
+
+
+@pytest.mark.parametrize("most_dense", [expectation_maximisation.MAX_DENSE_FRAMES, 0], ids=["dense", "factored"])
+def test_every_round_of_em_pulses(most_dense: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(expectation_maximisation, "MAX_DENSE_FRAMES", most_dense)
+    made = gallery.face(9, 40, degrees=60)
+    rows = (made.tracks.points - made.tracks.points.mean(axis=1, keepdims=True)).transpose(0, 2, 1).reshape(18, 40)
+    gram, projections = rows @ rows.T / 40, made.rotations[:, :2]
+    pulses = []
+    with pulses_to(lambda: pulses.append(1)):
+        expectation_maximisation.improve(
+            expectation_maximisation.begin(gram, projections), gram, projections, iterations=7
+        )
+    assert len(pulses) >= 7
+
+
+def test_the_upgrade_of_a_factorization_pulses() -> None:
+    factor = np.random.default_rng(0).normal(size=(12, 2, 6))
+    pulses = []
+    with pulses_to(lambda: pulses.append(1)):
+        refine_factor(factor, np.eye(6, 3))
+    assert len(pulses) > 5
 
 
 def test_ranges_pulse_only_on_the_calling_thread() -> None:

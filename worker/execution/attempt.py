@@ -82,7 +82,7 @@ def _conclude(attempt: Attempt, stored: Stored, *, worker: str, settings: Settin
                 stack.enter_context(_own_output(directory / OUTPUT))
             except OSError as error:
                 return attempt.conclude(attempt.failed(error))
-            with _limited_memory(settings.memory_limit):
+            with limited_memory(settings.memory_limit):
                 end = work(attempt, stored, directory)
             return attempt.conclude(end)
         except (StaleAttempt, UnknownJob) as error:
@@ -324,10 +324,11 @@ def _deadline(settings: Settings) -> float:
 
 
 @contextlib.contextmanager
-def _limited_memory(limit: int) -> Iterator[None]:
+def limited_memory(limit: int) -> Iterator[None]:
     """Limit the address space, so that too large an array raises MemoryError instead of ending the process."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (limit or soft, hard))
+    allowed = limit or soft
+    resource.setrlimit(resource.RLIMIT_AS, (allowed if hard == resource.RLIM_INFINITY else min(allowed, hard), hard))
     try:
         yield
     finally:

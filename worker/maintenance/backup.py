@@ -82,8 +82,6 @@ def write_backup(settings: Settings, target: Path) -> Summary:
                 continue
             copied, count = copied + fetched, count + 1
             out.write(json.dumps(found, ensure_ascii=False, separators=(",", ":")) + "\n")
-        out.flush()
-        os.fsync(out.fileno())
     rest = target / f"rest-{tag}.json"
     rest.write_text(json.dumps(snapshot.rest()), encoding="utf-8")
     manifest = {
@@ -92,7 +90,9 @@ def write_backup(settings: Settings, target: Path) -> Summary:
     }  # fmt: skip
     fresh = target / "manifest.json.new"
     fresh.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    os.sync()  # what the manifest names must outlast a power failure before the manifest replaces the old one
     fresh.replace(target / "manifest.json")
+    os.sync()  # and the new manifest before the files that only the old one names are removed
     _prune(target, manifest)
     return Summary(jobs=count, blobs=len(kept), bytes=sum(kept.values()), copied=copied)
 

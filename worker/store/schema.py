@@ -85,6 +85,8 @@ def prepare(settings: Settings) -> int:
                     return 0
                 count = _rewrite(client, at)
                 client.set(f"{at}schema", CURRENT)
+    except redis.exceptions.LockNotOwnedError:
+        logger.warning("the migration took longer than its lock lasts; another process may have repeated it")
     except redis.exceptions.LockError as error:
         logger.warning("another process still migrates the records: %s", error)
         return 0

@@ -21,7 +21,7 @@ from pliant.worker.ids import check_id, is_id
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.uploads.service import LATE, MAX_UPLOADS, Uploads
-from pliant.worker.uploads.states import State, UploadStates, open_states
+from pliant.worker.uploads.states import RESERVED_FOR, State, UploadStates, open_states
 from pliant.worker.uploads.writer import Capacity, Writer, agreed_length
 
 FOLDER = "uploads/"
@@ -220,6 +220,8 @@ class SharedWriter(Writer):
             self._digest.update(piece)
         if len(self._unsent) >= PIECE:
             self._store()
+        elif self._state is not None and time.time() > self._state.touched + RESERVED_FOR / 2:
+            self._swap()  # a slow connection takes minutes for a piece, and its reservation must not lapse meanwhile
 
     def _sha256(self) -> str:
         """Store the buffered bytes; return the digest of the complete upload."""

@@ -13,6 +13,7 @@ from pliant.solver import (
     InvalidInput,
     InvalidSettings,
     KnownCamera,
+    Outcome,
     Settings,
     Solution,
     Tracks,
@@ -247,6 +248,14 @@ def test_a_principal_point_off_centre_is_used() -> None:
     assert e3d_frame_scaled(found.shapes, SEEN) < 0.03
     assert reprojection(views, found).rms < 1.0
     assert found.camera.principal_point == pytest.approx(corner)
+
+
+def test_corrections_for_perspective_keep_to_the_maximum_number_of_reweightings() -> None:
+    settings = Settings(camera="perspective", focal=FOCAL, image_size=PICTURE, prior="smooth", max_reweightings=2)
+    cameras = KnownCamera.from_arrays(FACE.rotations, np.ones(8))
+    found = solve(pinhole(SEEN, FOCAL), cameras=cameras, settings=settings)
+    assert found.outcome is Outcome.MAX_REWEIGHTINGS
+    assert np.count_nonzero(found.trace.iterations) == 2
 
 
 @pytest.mark.slow

@@ -48,6 +48,8 @@ def test_rejected_is_zero_and_hidden_is_nan() -> None:
     assert np.isnan(found[seen == 0]).all()
     assert (found[rejected] == 0).all()
     assert (found[(seen > 0) & ~rejected] > 0).all()
+    far = inlier_probability(1e3 * LEFT, SEEN, NONE, noise_std=1e-3, extent=EXTENT, loss="l2")
+    assert (far > 0).all(), "0 means rejected"
     nothing = inlier_probability(LEFT, SEEN, ~NONE, noise_std=2.0, extent=EXTENT, loss="l1")
     assert (nothing == 0).all()
 

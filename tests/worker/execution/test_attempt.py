@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
@@ -245,3 +247,15 @@ def test_a_scratch_folder_that_cannot_be_made_fails_the_job_with_its_cause(
     assert job.error is not None
     assert job.error.code == "storage_failed"
     assert "NotADirectoryError" in jobs.log(id)
+
+
+def test_a_memory_limit_above_the_limit_of_the_process_has_no_effect() -> None:
+    script = (
+        "import resource; from pliant.worker.execution.attempt import limited_memory\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (1 << 36, 1 << 36))\n"
+        "with limited_memory(1 << 37): print(resource.getrlimit(resource.RLIMIT_AS)[0] == 1 << 36)\n"
+        "with limited_memory(1 << 35): print(resource.getrlimit(resource.RLIMIT_AS)[0] == 1 << 35)\n"
+        "print(resource.getrlimit(resource.RLIMIT_AS)[0] == 1 << 36)"
+    )
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    assert ran.stdout.split() == ["True"] * 3

@@ -108,6 +108,19 @@ def test_a_contradicted_layout_is_ambiguous(tmp_path: Path) -> None:
     assert "one.W and two.W" in two.got
 
 
+def test_a_matrix_whose_x_and_y_are_the_same_in_every_layout_is_ambiguous() -> None:
+    path = np.linspace(0.0, 100.0, 6)[:, None] + np.linspace(0.0, 500.0, 8)
+    error = refused("ambiguous_layout", {"W": np.concatenate([path, path])})
+    assert all("the same coordinate" in each["evidence"] for each in error.choices)
+
+
+def test_occlusion_that_is_not_finite_counts_as_hidden() -> None:
+    occluded = np.zeros(POINTS.shape[:2])
+    occluded[2, 1], occluded[3, 0] = np.nan, 1.0
+    read_as = understand({"tracks": POINTS, "occluded": occluded}, Options(layout="frames_points"))
+    assert np.argwhere(read_as.visible == 0).tolist() == [[2, 1], [3, 0]]
+
+
 def test_a_long_list_of_pixels_is_not_read_as_many_frames() -> None:
     y, x = np.mgrid[:80, :160].astype(float)
     first = np.stack([x, y], axis=-1).reshape(1, -1, 2)

@@ -157,6 +157,25 @@ def test_a_second_backup_copies_new_files_and_drops_deleted_ones(
     assert len(list(backup.glob("jobs-*"))) == len(list(backup.glob("rest-*"))) == 1
 
 
+def test_files_reach_the_disk_before_those_of_the_earlier_backup_are_removed(
+    jobs: Jobs, sent: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backup, seen = tmp_path / "backup", []
+    write_backup(jobs.settings, backup)
+    earlier = json.loads((backup / "manifest.json").read_text())
+    jobs.delete(sent["done"])
+
+    def look() -> None:
+        names = {path.name for path in backup.iterdir()}
+        assert set(earlier["files"]) < names
+        assert all((backup / "blobs" / key).is_file() for key in earlier["blobs"])
+        seen.append((json.loads((backup / "manifest.json").read_text()) == earlier, "manifest.json.new" in names))
+
+    monkeypatch.setattr("pliant.worker.maintenance.backup.os.sync", look)
+    write_backup(jobs.settings, backup)
+    assert seen == [(True, True), (False, False)]
+
+
 def test_a_job_deleted_during_the_backup_is_omitted(
     jobs: Jobs, sent: dict[str, str], empty: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from pliant.worker.maintenance.backup import restore_backup, write_backup
 from pliant.worker.maintenance.fsck import findings
 from pliant.worker.maintenance.reconciler import FORGOTTEN_AFTER, Reconciler
 from pliant.worker.settings import Settings
+from pliant.worker.store import schema
 from pliant.worker.store.connection import connect
 from pliant.worker.store.schema import CURRENT, STEPS, migrated, prepare
 from pliant.worker.tokens import Tokens
@@ -97,6 +99,19 @@ def test_simultaneous_starts_migrate_only_once(old: Settings) -> None:
     for each in threads:
         each.join()
     assert sorted(counts) == [0, 0, 0, 3]
+
+
+def test_a_migration_that_outlasts_its_lock_is_counted(old: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(schema, "_LOCK_SECONDS", 0.05)
+    rewrite = schema._rewrite
+
+    def slowly(client: Any, at: str) -> int:
+        time.sleep(0.2)
+        return rewrite(client, at)
+
+    monkeypatch.setattr(schema, "_rewrite", slowly)
+    assert prepare(old) == 3
+    assert prepare(old) == 0
 
 
 def test_data_of_a_newer_version_is_refused_by_every_process(

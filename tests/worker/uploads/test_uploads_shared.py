@@ -7,6 +7,7 @@ import secrets
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from pliant.worker import errors
@@ -198,6 +199,19 @@ def test_limits_apply_across_all_processes(hosts: list[SharedUploads]) -> None:
         send(two, "one-more", b"x")
     send(two.of("ada"), "one-more", b"x")
     assert one.find("one-more") is None
+
+
+def test_a_slow_upload_keeps_its_reservation(hosts: list[SharedUploads], monkeypatch: pytest.MonkeyPatch) -> None:
+    one, two = hosts
+    clock, tight = [1e9], Capacity(max_bytes=10_000, quota=1000)
+    monkeypatch.setattr(shared, "time", SimpleNamespace(time=lambda: clock[0]))
+    with one.write("slow", offset=0, length=900, capacity=tight) as writer:
+        for _ in range(4):  # bytes that do not fill a piece, for longer than a reservation lasts
+            clock[0] += RESERVED_FOR / 2 + 1
+            writer.write(b"x")
+            assert two.used() == 900
+        clock[0] += RESERVED_FOR + 1
+        assert two.used() == 0, "no byte came, so the process may have been killed"
 
 
 def test_unused_uploads_expire_and_stray_pieces_are_removed(hosts: list[SharedUploads], tmp_path: Path) -> None:

@@ -155,12 +155,14 @@ def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: 
     ranked = sorted(allowed, key=lambda one: costs[one.layout])
     documented = [one for one in ranked if order in (None, one.order) or options.layout != "auto"] or ranked
     best, others = documented[0], documented[1:]
-    clear = all(costs[other.layout] >= MIN_SMOOTHNESS_RATIO * costs[best.layout] for other in others)
+    clear = not others or (
+        np.isfinite(costs[best.layout])
+        and all(costs[other.layout] >= MIN_SMOOTHNESS_RATIO * costs[best.layout] for other in others)
+    )
     if clear and costs[best.layout] <= CONTRADICTED * costs[ranked[0].layout]:
-        return best, [_evidence(best, others[0], costs)] if others else []
+        return best, [_comparison(best, others[0], costs)] if others else []
     choices: list[dict[str, Any]] = [
-        {"layout": one.layout, "options": one.options, "evidence": f"mean step in time: {_number(costs[one.layout])}"}
-        for one in ranked
+        {"layout": one.layout, "options": one.options, "evidence": _evidence(costs[one.layout])} for one in ranked
     ]
     raise AmbiguousInput(
         field="tracks", expected="tracks whose layout is certain", got=f"{name} of shape {array.shape}, which can be read as "
@@ -212,13 +214,11 @@ def _is_allowed(reading: Reading, options: Options) -> bool:
     )
 
 
-def _evidence(best: Reading, other: Reading, costs: dict[str, float]) -> str:
-    return (
-        f"Read as {best.layout}, where the mean step in time is {_number(costs[best.layout])}; "
-        f"as {other.layout}: {_number(costs[other.layout])}."
-    )
+def _comparison(best: Reading, other: Reading, costs: dict[str, float]) -> str:
+    return f"Read as {best.layout} ({_evidence(costs[best.layout])}), not as {other.layout} ({_evidence(costs[other.layout])})."
 
 
-def _number(cost: float) -> str:
-    same = "x and y would be the same coordinate, or no point is seen twice"
-    return f"{cost:.3g} of the coordinates' spread" if np.isfinite(cost) else same
+def _evidence(cost: float) -> str:
+    if not np.isfinite(cost):
+        return "x and y would be the same coordinate, or no point is seen twice"
+    return f"mean step in time: {cost:.3g} of the coordinates' spread"

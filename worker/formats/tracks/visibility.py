@@ -131,7 +131,7 @@ def _meant(name: str, values: NDArray[np.float64], kind: str) -> tuple[NDArray[n
         kind = _guessed(name, finite, low, high)
     if kind == "bool":
         word = "0 or not 0" if high > 1 or low < 0 else "0 or 1"
-        return np.where(np.isfinite(values), (values != 0).astype(np.float64), 0.0), word
+        return np.where(np.isfinite(values), (values != 0).astype(np.float64), np.nan), word
     if kind == "logits":
         with np.errstate(over="ignore"):
             return 1.0 / (1.0 + np.exp(-values)), f"logits (values from {low:.3g} to {high:.3g})"
