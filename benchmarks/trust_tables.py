@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from pliant.solver.evaluation.metrics import NINETY
-from pliant.solver.evaluation.trust import LOOSE_HELD_OUT, UNTOLD
+from pliant.solver.evaluation.trust import LOOSE_HELD_OUT, LEAST_TURN
 
 from benchmarks.sequences import RECONSTRUCTED
 
@@ -117,14 +117,14 @@ def turn_over_deformation(row: Row) -> float | None:
 
 
 def turns_slowly(row: Row) -> bool | None:
-    """Return whether turn over deformation is below `UNTOLD`; None for unordered photographs."""
+    """Return whether turn over deformation is below `LEAST_TURN`; None for unordered photographs."""
     found = turn_over_deformation(row)
-    return None if found is None else found < UNTOLD
+    return None if found is None else found < LEAST_TURN
 
 
 SIGNS = {
     f"held-out observations {LOOSE_HELD_OUT:.0%} of the size and more from their prediction": misses_held_out,
-    f"turn over deformation per frame below {UNTOLD:g}": turns_slowly,
+    f"turn over deformation per frame below {LEAST_TURN:g}": turns_slowly,
 }
 
 

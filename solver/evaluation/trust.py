@@ -33,7 +33,7 @@ leaves .06. A prior with as many modes as frames fits anything; `LOST_HELD_OUT` 
 NARROW, STILL = 20.0, 5.0
 """Angle between the two most different views, degrees, for the same two verdicts. The error of depth grows as the inverse of the angle."""
 
-UNTOLD = 1.0
+LEAST_TURN = 1.0
 """Rotation of the camera per frame, radians, divided by the deformation per frame, relative to the size (medians over a film), below which
 rotation and deformation are hard to separate. A lower frame rate increases both alike, so the ratio is a property of the motion. Solves of
 `benchmarks.trust` below 1 have errors of .05 and more."""
@@ -60,6 +60,10 @@ class Verdict(StrEnum):
 
     DO_NOT_USE = "do_not_use"
     """Depth or shape is probably wrong; `Trust.reasons` says why."""
+
+
+Sign = tuple[Verdict, str]
+"""A verdict and the sentence that is the reason for it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,10 +105,17 @@ class Trust:
     deformation_per_frame: float | None = None
     """Median over consecutive frames of the points' RMS motion in world axes, relative to the size; None for unordered photographs."""
 
+    depth_from_lengths: bool = False
+    """Whether constant edge lengths, not the turn of the camera, determine depth: an isometric surface."""
+
     @property
     def sentence(self) -> str:
-        """Summary of the expected error and of the turn that determines depth."""
-        rests = f"depth rests on {self.turn_degrees:.0f}° of turn"
+        """Summary of the expected error and of what determines depth."""
+        rests = (
+            "depth rests on constant lengths"
+            if self.depth_from_lengths
+            else f"depth rests on {self.turn_degrees:.0f}° of turn"
+        )
         if self.expected_error is None:
             return f"The error is not estimated; {rests}."
         if self.interval is None:
@@ -162,33 +173,93 @@ def assess(
     unclear_camera : str, optional
         Sentence that states why the camera model is in doubt; None if it is not.
     """
-    size = size_of(shapes)
+    size, shown = size_of(shapes), np.ones(len(shapes), dtype=bool) if shown is None else shown
     pulse()
-    seen = visible > 0
     expected = None if shapes_std is None else float(np.sqrt(np.square(shapes_std).mean())) / size
-    bounded = expected is not None and not (planar or depth_is_typical)
-    interval = (INTERVAL[0] * expected, INTERVAL[1] * expected) if expected is not None and bounded else None
-    relative = (residuals / scales[:, None])[seen]
-    pulse()
-    residual = float(np.median(relative)) / size if relative.size else np.inf
-    shown = np.ones(len(shapes), dtype=bool) if shown is None else shown
+    bounded = not (planar or depth_is_typical)
+    residual, hidden = _fit(residuals, visible, scales, size)
     turn = turned(rotations[shown])
-    hidden = 1.0 - float(seen.mean())
-    unseen = f"{hidden:.0%} of the positions are hidden and interpolated from their surroundings."
+    turning, deforming = per_frame(shapes, rotations) if ordered else (None, None)
     found = [
-        _sign(residual, LOOSE, LOST, f"The shapes miss the tracks by {_percent(residual)} of the object's size."),
+        *_observation_signs(residual, hidden),
         _sign(-turn, -NARROW, -STILL, f"The camera turned by only {turn:.0f}°; depth needs {NARROW:.0f}° or more."),
-        _sign(hidden, HIDDEN_SHARE, UNSEEN_SHARE, unseen),
+        *_frame_signs(shown, behind, ordered=ordered),
+        *_error_signs(expected, held_out_error, bounded=bounded),
+        *_motion_signs(turning, deforming),
+        *_model_signs(
+            modes, len(shapes), off=off_plane(shapes) if planar else None, turn=turn if depth_is_typical else None
+        ),
     ]
+    if unclear_camera is not None:
+        found.append((Verdict.WITH_CARE, unclear_camera))
+    verdict, reasons = _most_serious_first(found)
+    interval = (INTERVAL[0] * expected, INTERVAL[1] * expected) if expected is not None and bounded else None
+    return Trust(
+        verdict, reasons, expected, interval, turn, residual, hidden, held_out_error, turning, deforming,
+    )  # fmt: skip
+
+
+def assess_isometric(
+    shapes: Floats,
+    rotations: Floats,
+    residuals: Floats,
+    visible: Floats,
+    *,
+    scales: Floats,
+    ordered: bool,
+    warnings: tuple[str, ...],
+) -> Trust:
+    """Return the verdict on an isometric surface; the arrays are as for `assess`.
+
+    Constant edge lengths, not the turn of the camera, determine its depth. There is no expected error, because isometry is not a
+    Gaussian model. `warnings` are the sentences of its search, each of which is a reason for `with_care`.
+    """
+    residual, hidden = _fit(residuals, visible, scales, size_of(shapes))
+    turning, deforming = per_frame(shapes, rotations) if ordered else (None, None)
+    verdict, reasons = _most_serious_first(
+        [*((Verdict.WITH_CARE, warning) for warning in warnings), *_observation_signs(residual, hidden)]
+    )
+    return Trust(
+        verdict, reasons, None, None, turned(rotations), residual, hidden,
+        degrees_per_frame=turning, deformation_per_frame=deforming, depth_from_lengths=True,
+    )  # fmt: skip
+
+
+def _fit(residuals: Floats, visible: Floats, scales: Floats, size: float) -> tuple[float, float]:
+    """Return the median residual of the observations used, relative to the size, and the share of positions without one."""
+    used = visible > 0
+    pulse()
+    relative = (residuals / scales[:, None])[used]
+    pulse()
+    return float(np.median(relative)) / size if relative.size else np.inf, 1.0 - float(used.mean())
+
+
+def _observation_signs(residual: float, hidden: float) -> list[Sign]:
+    return [
+        _sign(residual, LOOSE, LOST, f"The shapes miss the tracks by {_percent(residual)} of the object's size."),
+        _sign(
+            hidden, HIDDEN_SHARE, UNSEEN_SHARE,
+            f"{hidden:.0%} of the positions are hidden and interpolated from their surroundings.",
+        ),
+    ]  # fmt: skip
+
+
+def _frame_signs(shown: NDArray[np.bool_], behind: NDArray[np.bool_] | None, *, ordered: bool) -> list[Sign]:
+    """Return the reasons in single frames: points behind the camera, and hardly a point visible."""
+    found = []
     if behind is not None and behind.any():
         which = _frames(behind, ordered=ordered)
         found.append((Verdict.DO_NOT_USE, f"In {which}, points of the shape lie behind the camera."))
-    if unclear_camera is not None:
-        found.append((Verdict.WITH_CARE, unclear_camera))
     if not shown.all():
         which = _frames(~shown, ordered=ordered)
-        sentence = f"Hardly a point is visible in {which}: the shapes there are guesses. Keep the object in the picture, or leave them out."
+        sentence = f"Almost no points are visible in {which}, so the shapes there are guesses. Leave these frames out."
         found.append((Verdict.WITH_CARE, sentence))
+    return found
+
+
+def _error_signs(expected: float | None, held_out_error: float | None, *, bounded: bool) -> list[Sign]:
+    """Return the reasons in the expected error, which is a lower bound unless `bounded`, and in the error of left-out observations."""
+    found = []
     if expected is not None:
         upper = INTERVAL[1] * expected
         large = f"may be as large as {_share(upper)}" if bounded else f"is expected to be at least {_share(expected)}"
@@ -197,17 +268,13 @@ def assess(
         far = f"{_percent(held_out_error)} of the object's size"
         sentence = f"Observations that were left out are {far} from where the others predict them."
         found.append(_sign(held_out_error, LOOSE_HELD_OUT, LOST_HELD_OUT, sentence))
-    turning, deforming = per_frame(shapes, rotations) if ordered else (None, None)
-    if turning is not None and deforming is not None:
-        found += _untold(turning, deforming)
-    off = off_plane(shapes) if planar else None
-    found += _doubts(modes, len(shapes), off=off, turn=turn if depth_is_typical else None)
+    return found
+
+
+def _most_serious_first(found: list[Sign]) -> tuple[Verdict, tuple[str, ...]]:
+    """Return the verdict and its reasons."""
     signs = sorted((sign for sign in found if sign[0] is not Verdict.GOOD), key=lambda sign: -_SEVERITY[sign[0]])
-    verdict = signs[0][0] if signs else Verdict.GOOD
-    return Trust(
-        verdict, tuple(sentence for _, sentence in signs), expected, interval, turn, residual, hidden,
-        held_out_error, turning, deforming,
-    )  # fmt: skip
+    return signs[0][0] if signs else Verdict.GOOD, tuple(sentence for _, sentence in signs)
 
 
 def _frames(chosen: NDArray[np.bool_], *, ordered: bool) -> str:
@@ -217,9 +284,9 @@ def _frames(chosen: NDArray[np.bool_], *, ordered: bool) -> str:
     return f"{count} of {len(chosen)} frames{first}"
 
 
-def _untold(turning: float, deforming: float) -> list[tuple[Verdict, str]]:
-    """Return the reason, if the shape changes more per frame than the camera turns (`UNTOLD`)."""
-    if np.radians(turning) >= UNTOLD * deforming:
+def _motion_signs(turning: float | None, deforming: float | None) -> list[Sign]:
+    """Return the reason, if the shape changes more per frame than the camera turns (`LEAST_TURN`)."""
+    if turning is None or deforming is None or np.radians(turning) >= LEAST_TURN * deforming:
         return []
     sentence = (
         f"The camera turns by {turning:.2g}° in a frame, while the shape changes by {_percent(deforming)} of its size, as much as "
@@ -228,28 +295,26 @@ def _untold(turning: float, deforming: float) -> list[tuple[Verdict, str]]:
     return [(Verdict.WITH_CARE, sentence)]
 
 
-def _doubts(modes: int, frames: int, *, off: float | None, turn: float | None) -> list[tuple[Verdict, str]]:
+def _model_signs(modes: int, frames: int, *, off: float | None, turn: float | None) -> list[Sign]:
     """Return the reasons to doubt the model itself, which the standard deviations do not include.
 
     `off` is the distance of a sheet from its plane, relative to its size; `turn` is the angle of turn, degrees, of an object whose depth a
     prior determines. Each is None where it does not apply.
     """
-    found: list[tuple[Verdict, str]] = []
+    found = []
     if modes > FLEXIBLE * frames:
-        sentence = (
+        found.append(
             f"{modes} modes of deformation in {frames} frames: the motion hardly determines depth. Use more frames."
         )
-        found.append((Verdict.WITH_CARE, sentence))
     if off is not None:
-        sentence = f"A thin sheet, {_percent(off)} of its size off its plane; the motion hardly shows bending."
-        found.append((Verdict.WITH_CARE, sentence))
-    if turn is not None:
-        sentence = (
-            f"With {turn:.0f}° of turn the tracks hardly determine the object's depth; a depth typical for its width is assumed. Let it "
-            "turn further."
+        found.append(
+            f"The object is nearly flat, {_percent(off)} of its size off its plane, so the motion hardly shows bending."
         )
-        found.append((Verdict.WITH_CARE, sentence))
-    return found
+    if turn is not None:
+        found.append(
+            f"A turn of {turn:.0f}° hardly determines the object's depth; a depth typical for its width is assumed. Let it turn further."
+        )
+    return [(Verdict.WITH_CARE, sentence) for sentence in found]
 
 
 def size_of(shapes: Floats) -> float:
@@ -294,7 +359,7 @@ def turned(rotations: Floats) -> float:
 _SEVERITY = {Verdict.GOOD: 0, Verdict.WITH_CARE: 1, Verdict.DO_NOT_USE: 2}
 
 
-def _sign(value: float, care: float, never: float, sentence: str) -> tuple[Verdict, str]:
+def _sign(value: float, care: float, never: float, sentence: str) -> Sign:
     if value >= never:
         return Verdict.DO_NOT_USE, sentence
     return (Verdict.WITH_CARE if value >= care else Verdict.GOOD), sentence

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from pliant.solver.evaluation.alignment import procrustes
-from pliant.solver.evaluation.trust import Trust, Verdict, per_frame, size_of, turned
+from pliant.solver.evaluation.trust import assess_isometric
 from pliant.solver.isometry.surface import IsometricSurface, IsometricVerdict
 from pliant.solver.records import Camera, Choices, Floats, Tracks, read_only
 from pliant.solver.settings import Settings
@@ -57,29 +57,16 @@ def isometric_solution(
     residual = np.where(seen, np.linalg.norm(camera.project(shapes) - tracks.points, axis=2), 0.0)
     weights = (seen & ~surface.outliers & surface.placed).astype(np.float64)
     median = float(np.median(residual[seen]))
-    relative = float(np.median((residual / camera.scales[:, None])[seen])) / size_of(shapes)
     for array in (shapes, residual, weights):
         read_only(array)
     trace = Trace(np.array([surface.inconsistency]), np.array([median]), np.zeros(1, dtype=np.int32))
     choices = _choices(verdict, surface, unit, float(surface.outliers.sum() / seen.sum()))
     return Solution(
         shapes, camera, residual, weights, trace, Outcome.STOPPED if stopped else Outcome.CONVERGED, choices, seconds,
-        trust=_trust(
-            choices.warnings, camera, shapes,
-            residual=relative, hidden=float((weights == 0).mean()), ordered=settings.order == "film",
+        trust=assess_isometric(
+            shapes, camera.rotations, residual, weights, scales=camera.scales, ordered=settings.order == "film",
+            warnings=choices.warnings,
         ),
-    )  # fmt: skip
-
-
-def _trust(
-    warnings: tuple[str, ...], camera: Camera, shapes: Floats, *, residual: float, hidden: float, ordered: bool
-) -> Trust:
-    """Return the verdict without an expected error: isometry is not a Gaussian model, so there is no posterior."""
-    grade = Verdict.WITH_CARE if warnings else Verdict.GOOD
-    turning, deforming = per_frame(shapes, camera.rotations) if ordered else (None, None)
-    return Trust(
-        grade, warnings, None, None, turned(camera.rotations), residual, hidden,
-        degrees_per_frame=turning, deformation_per_frame=deforming,
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pliant.solver import Camera, KnownCamera, Settings, Tracks, gallery, solve
 from pliant.solver.evaluation.metrics import e3d_frame
-from pliant.solver.evaluation.trust import Verdict, assess, per_frame, turned
+from pliant.solver.evaluation.trust import Trust, Verdict, assess, assess_isometric, per_frame, size_of, turned
 from pliant.solver.shapes.assessment import frames_behind
 from scipy.spatial.transform import Rotation
 
@@ -32,6 +32,28 @@ def judged(**changed: Any) -> Any:
 
 def test_frames_that_show_nothing_do_not_count_as_turn() -> None:
     assert judged(shown=np.arange(FRAMES) < 7).turn_degrees == pytest.approx(60 * 6 / 11)
+
+
+def test_an_isometric_surface_needs_no_turn_but_must_be_seen_and_explain_the_tracks() -> None:
+    shapes = np.random.default_rng(0).normal(size=(FRAMES, POINTS, 3))
+    still, near, seen = np.tile(np.eye(3), (FRAMES, 1, 1)), np.full((FRAMES, POINTS), 0.001), np.ones((FRAMES, POINTS))
+
+    def isometric(residuals: Any = near, visible: Any = seen, warnings: tuple[str, ...] = ()) -> Trust:
+        return assess_isometric(
+            shapes, still, residuals, visible, scales=np.ones(FRAMES), ordered=False, warnings=warnings
+        )
+
+    good = isometric()
+    assert (good.verdict, good.reasons) == (Verdict.GOOD, ())
+    assert good.sentence == "The error is not estimated; depth rests on constant lengths."
+    little = isometric(visible=seen * (np.arange(POINTS) < 9))
+    assert (little.verdict, little.reasons[0][:4]) == (Verdict.WITH_CARE, "70% ")
+    assert isometric(np.full((FRAMES, POINTS), 0.9)).verdict is Verdict.DO_NOT_USE
+    assert isometric(warnings=("The focal length is improbable.",)).reasons == ("The focal length is improbable.",)
+    both = isometric(np.full((FRAMES, POINTS), 0.9), warnings=("The focal length is improbable.",))
+    assert both.reasons[1] == "The focal length is improbable."
+    rejected = np.where(np.arange(POINTS) < 20, near, 0.9)
+    assert isometric(rejected, seen * (np.arange(POINTS) < 20)).residual == pytest.approx(0.001 / size_of(shapes))
 
 
 def test_points_behind_a_pinhole_camera_are_found() -> None:
@@ -79,11 +101,11 @@ def test_a_result_without_reasons_against_it_is_good() -> None:
         (
             {"shown": np.arange(FRAMES) < 7},
             Verdict.WITH_CARE,
-            "Hardly a point is visible in 5 of 12 frames (the first is frame 7)",
+            "Almost no points are visible in 5 of 12 frames (the first is frame 7)",
         ),
         ({"behind": np.arange(FRAMES) > 9, "ordered": False}, Verdict.DO_NOT_USE, "In 2 of 12 frames, points"),
-        ({"planar": True}, Verdict.WITH_CARE, "A thin sheet, 45 % of its size off its plane"),
-        ({"depth_is_typical": True}, Verdict.WITH_CARE, "With 60° of turn the tracks hardly determine"),
+        ({"planar": True}, Verdict.WITH_CARE, "The object is nearly flat, 45 % of its size off its plane"),
+        ({"depth_is_typical": True}, Verdict.WITH_CARE, "A turn of 60° hardly determines"),
         ({"modes": 7}, Verdict.WITH_CARE, "7 modes of deformation in 12 frames"),
         (
             {"held_out_error": 0.09},
