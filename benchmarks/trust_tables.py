@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from pliant.solver.evaluation.metrics import NINETY
-from pliant.solver.evaluation.trust import LOOSE_HELD_OUT, LEAST_TURN
+from pliant.solver.evaluation.trust import LEAST_TURN, LOOSE_HELD_OUT
 
 from benchmarks.sequences import RECONSTRUCTED
 
