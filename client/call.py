@@ -73,11 +73,13 @@ def headers_of(token: str | None, more: Mapping[str, str] | None) -> dict[str, s
     Raises
     ------
     BadArgument
-        The token has characters that no token has; the message does not show it.
+        The token is not a text, or has characters that no token has; the message does not show it.
     """
     headers = {"User-Agent": f"pliant-client/{version('pliant')}"}
-    if token is not None:
-        token = token.strip()
+    if token is not None and not isinstance(token, str):
+        raise BadArgument(f"token: expected a str, got a value of type {type(token).__name__}.")
+    token = "" if token is None else token.strip()
+    if token:
         if not token.isascii() or not token.isprintable() or " " in token:
             raise BadArgument(
                 "token, or PLIANT_TOKEN: expected ASCII letters, digits and signs, got others. Copy the token again."

@@ -135,7 +135,8 @@ def region_part(region: Region, folder: Path) -> Path:
         )
     from PIL import Image  # here, because it is not needed otherwise
 
-    inside = mask if mask.dtype == bool else np.asarray(mask, dtype=np.uint8) >= 128
+    # A mask of 0 and 1, as segmentation models return it, or a picture of 0 to 255.
+    inside = mask if mask.dtype == bool else mask >= (1 if mask.max() == 1 else 128)
     path = folder / "region.png"
     Image.fromarray(np.where(inside, 255, 0).astype(np.uint8)).save(path)
     return path
@@ -209,7 +210,7 @@ def existing_file(path: Path | str, name: str) -> Path:
 def _array(value: Any, name: str) -> NDArray[np.generic]:
     """Convert anything that NumPy accepts, and PyTorch and JAX tensors on any device."""
     for step in ("detach", "cpu"):
-        if hasattr(value, step):
+        if hasattr(value, "__array__") and hasattr(value, step):  # a file has `detach`, too, which makes it unusable
             value = getattr(value, step)()
     try:
         array = np.asarray(value)

@@ -7,11 +7,13 @@ import random
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import SupportsFloat
 
 import httpx
 from pliant.client.call import Call
 from pliant.client.errors import (
     APIStatusError,
+    BadArgument,
     PliantError,
     ServiceFailed,
     TooManyRequests,
@@ -73,6 +75,8 @@ class Retry:
 class Contact:
     """State that a client keeps between calls."""
 
+    url: str
+    """Address of the service."""
     made: bool = False
     """True once the service has responded."""
     follows: bool = True
@@ -96,6 +100,8 @@ class Attempts:
     deadline: float = field(init=False)
 
     def __post_init__(self) -> None:
+        if self.timeout is not None:
+            self.timeout = _seconds(self.timeout)
         self.deadline = math.inf if self.timeout is None else self.retries.clock() + self.timeout
 
     def remaining(self) -> float:
@@ -182,9 +188,18 @@ class Attempts:
         if isinstance(fault, PliantError):
             return fault
         return Unreachable(
-            f"No answer from the service: {str(fault) or type(fault).__name__}. "
+            f"No answer from the service at {self.contact.url}: {str(fault) or type(fault).__name__}. "
             "Check the address, and that `pliant up` is running there."
         )
+
+
+def _seconds(timeout: object) -> float:
+    """Return a timeout, which may be a number of NumPy, as a float."""
+    number = isinstance(timeout, SupportsFloat) and not isinstance(timeout, bool)
+    seconds = float(timeout) if number else math.nan  # type: ignore[arg-type]
+    if math.isnan(seconds):
+        raise BadArgument(f"timeout: expected seconds as a number, or None, got {timeout!r}.")
+    return seconds
 
 
 def may_repeat(call: Call, fault: Exception) -> bool:

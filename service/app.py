@@ -83,6 +83,7 @@ def create_app(
         middleware=middleware(settings, tokens, metrics, jobs_of_all.records),
         docs_url=None,  # FastAPI's page loads Swagger UI from a CDN, which the content-security policy forbids; see `page`
         redoc_url=None,
+        redirect_slashes=False,  # behind a proxy, the absolute address of such a redirect would be that of plain http
     )
     routes = [route for each in ROUTES for route in each.router.routes]
     problems.install(app, STATUS_OF, routes=routes, security_headers=SECURITY_HEADERS)

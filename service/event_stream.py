@@ -76,17 +76,16 @@ class Followers:
             self._start_reader(jobs.records)  # before the first read, so that no change falls between the two
             known = await run_in_threadpool(jobs.events, id, after=after)
             last = after or "0-0"
-            if not known and (await run_in_threadpool(jobs.get, id)).status.final:
+            ended = (await run_in_threadpool(jobs.get, id)).status.final
+            if ended:
                 known = await run_in_threadpool(jobs.events, id, after=after)  # it may have ended between the two reads
-                if not known:
-                    return  # nothing follows the last event of a finished job
             while True:
                 for event in known:
                     last = event.id
                     yield event
                     if is_final(event):
                         return
-                if self.closing.is_set():
+                if ended or self.closing.is_set():
                     return
                 if watcher.failure is not None:
                     raise watcher.failure

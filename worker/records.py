@@ -138,8 +138,10 @@ class Beat(NamedTuple):
 Change = Callable[[Stored], Stored]
 
 
-def event_of(before: Stored | None, after: Stored) -> tuple[str, str]:
-    """Return name and data of the event for this change."""
+def event_of(before: Stored | None, after: Stored) -> tuple[str, str] | None:
+    """Return name and data of the event for this change; None if the job had already ended, since its last event says so."""
+    if before is not None and before.job.status.final and after.job.status.final:
+        return None
     if before is not None and after.job.progress is not None:
         still = {"progress": None}
         if before.job.model_copy(update=still) == after.job.model_copy(update=still):

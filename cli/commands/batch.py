@@ -234,7 +234,7 @@ class Batch:
 
         longest = max((len(row.job.id) for row in self.rows if row.job is not None), default=0)
         job_column = Column("job", no_wrap=True, min_width=longest)  # ids stay complete on narrow terminals
-        table = Table("file", job_column, "status", "verdict", "seconds", "")
+        table = Table("file", job_column, "status", "verdict", "seconds")
         for row in self.rows:
             job = row.job
             status = "refused" if job is None else str(job.status)
@@ -246,9 +246,11 @@ class Batch:
             table.add_row(
                 Text(str(row.file)), "" if job is None else job.id, Text(status, COLOURS.get(status, "red")),
                 judged(job), "" if took is None else f"{took.total_seconds():.1f}",
-                Text("" if row.error is None else self._refusal(row.error)),
             )  # fmt: skip
         out().print(table)
+        for row in self.rows:
+            if row.error is not None:  # not in the table, which would cut it off on narrow terminals
+                out().print(Text(f"{row.file}: {self._refusal(row.error)}"), soft_wrap=True)
 
     def _refusal(self, error: Exception) -> str:
         """Return the message of an error with a reference to its explanation."""

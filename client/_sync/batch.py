@@ -33,6 +33,10 @@ def mapped(
     """Submit inputs and yield their results: see `Client.map`."""
     if at_once < 1:
         raise BadArgument(f"at_once: expected at least 1 job, got {at_once}.")
+    if isinstance(inputs, (str, bytes, Path, Mapping)) or getattr(inputs, "ndim", 4) < 4:
+        raise BadArgument(
+            f"inputs: expected a list of inputs, got one ({type(inputs).__name__}). Put it into a list, or use submit."
+        )
     ahead: deque[tuple[int, RemoteJob]] = deque()
 
     def finished() -> Result | None:

@@ -12,6 +12,7 @@ from typing import Any, Self
 import httpx
 from pliant.client._sync.transport import Exchange
 from pliant.client.call import base_of, headers_of
+from pliant.client.errors import BadArgument
 from pliant.client.retry import Attempts, Contact, Retry
 
 DEFAULT_URL = "http://127.0.0.1:8000"
@@ -44,7 +45,7 @@ class Connection:
             transport=transport,
         )
         self._retries = retries
-        self._contact = Contact()
+        self._contact = Contact(url=self.url)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.url}>"
@@ -62,5 +63,7 @@ class Connection:
         self._http.close()
 
     def _exchange(self, timeout: float | None, doing: str = "the call") -> Exchange:
+        if self._http.is_closed:
+            raise BadArgument("The client is closed. Create a new one.")
         attempts = Attempts(retries=self._retries, contact=self._contact, timeout=timeout, doing=doing)
         return Exchange(self._http, attempts)

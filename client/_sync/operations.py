@@ -17,7 +17,7 @@ from pliant.client._sync.events import follow
 from pliant.client._sync.transport import Exchange, parse
 from pliant.client._sync.upload import delete_uploads, upload_large
 from pliant.client.call import Call
-from pliant.client.errors import InvalidRequest
+from pliant.client.errors import BadArgument, InvalidRequest
 from pliant.client.multipart import Inputs, OnBytes, option_fields
 from pliant.client.pauses import in_place, sleep
 from pliant.client.requests import key_header
@@ -47,6 +47,8 @@ def submit(
     on_upload: OnBytes | None,
 ) -> Job:
     """Submit inputs and return the new job. Temporary files are written to `folder`, which the caller removes."""
+    if not isinstance(name, str):
+        raise BadArgument(f"name: expected a str, got a value of type {type(name).__name__}.")
     texts = {
         "name": name.encode("utf-8", "replace").decode(), "webhook": webhook or "", "webhook_secret": webhook_secret or "",
         "priority": "" if priority == "normal" else priority,  # omitted for services without priorities

@@ -68,6 +68,9 @@ _BODY = {
 }
 _ERRORS = problems(400, 401, 403, 404, 408, 409, 413, 422, 429, 503, 507)
 
+_DIGEST = re.compile(r"([a-z*][a-z0-9_.*-]*)=:([A-Za-z0-9+/=]*):")
+"""A member of a Repr-Digest: a byte sequence in a dictionary of structured fields (RFC 8941)."""
+
 
 @router.put(
     "/{id}",
@@ -239,22 +242,25 @@ async def _find_complete(uploads: Uploads, id: str, sending: Sending) -> Upload 
 
 
 def _sha256(digest: str | None) -> str | None:
-    """Return the SHA-256 of a Repr-Digest (RFC 9530) in hexadecimal; other algorithms are ignored.
+    """Return the SHA-256 of a Repr-Digest (RFC 9530) in hexadecimal; None without one. Other algorithms are ignored.
 
     Raises
     ------
     Refusal
         The digest is malformed.
     """
-    found = re.search(r"(?:^|,)\s*sha-256=:([^:]*):", digest or "")
-    if found is None:
+    if digest is None:
+        return None
+    members = [_DIGEST.fullmatch(member.strip()) for member in digest.split(",")]
+    given = [member[2] for member in members if member is not None and member[1] == "sha-256"]
+    if not given and None not in members:
         return None
     try:
-        value = base64.b64decode(found[1], validate=True)
-    except ValueError:  # not base64, or not ASCII
+        value = base64.b64decode(given[-1], validate=True) if given else b""
+    except ValueError:  # not base64
         value = b""
     if len(value) != 32:
-        expected, got, hint = "sha-256=:BASE64 of 32 bytes:", found[0][:80], "Encode the raw digest, or leave it out."
+        expected, got, hint = "sha-256=:BASE64 of 32 bytes:", digest[:80], "Encode the raw digest, or leave it out."
         code = ProblemCode.INVALID_DIGEST
         raise wrong_input(code, field="Repr-Digest", expected=expected, got=got, hint=hint)
     return value.hex()

@@ -79,6 +79,18 @@ def test_a_job_that_was_cancelled_is_submitted_again(takes: Path) -> None:
     assert submit() == second
 
 
+def test_reasons_of_refusals_are_complete_on_a_narrow_terminal(
+    run: Run, takes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    np.savez(takes / "short.npz", tracks=np.zeros((2, 12, 2)))
+    ran = run("submit", takes, "--mesh", "none")
+    assert ran.exit_code == Exit.FAILED
+    (line,) = [line for line in ran.stdout.splitlines() if line.startswith(str(takes / "short.npz"))]
+    assert "expected at least 3 frames" in line
+    assert "More about this error: http" in line
+
+
 def test_a_folder_with_tracks_and_pictures_is_refused(run: Run, takes: Path) -> None:
     (takes / "frame-1.png").write_bytes(b"")
     ran = run("submit", takes)

@@ -70,3 +70,12 @@ def test_jobs_are_named_after_their_files_up_to_the_length_limit(tmp_path: Path)
     with Client("http://pliant.test", transport=InMemoryService(steps=1)) as client:
         names = [result.job.name for result in client.map(files, mesh="none", load=False)]
     assert names == ["face", "x" * LONGEST_NAME]
+
+
+@pytest.mark.parametrize("one", ["tracks.npz", Path("tracks.npz"), inputs(1)[0], {"tracks": inputs(1)[0]}])
+def test_map_refuses_a_single_input(one: object) -> None:
+    with (
+        Client("http://pliant.test", transport=InMemoryService()) as client,
+        pytest.raises(BadArgument, match="inputs: expected a list of inputs, got one"),
+    ):
+        list(client.map(one))  # type: ignore[arg-type]

@@ -21,7 +21,7 @@ from pliant.service.spool import Incoming
 from pliant.worker import errors
 from pliant.worker.errors import InvalidSetting, StoreUnavailable
 from pliant.worker.formats.records import Limits
-from pliant.worker.records import utc_now
+from pliant.worker.records import EVENTS_KEPT_AT_LAST, utc_now
 from pliant.worker.store.blobs import Blobs
 from serving import Running, Serve, finish, settings_from, submit, until
 
@@ -108,6 +108,19 @@ def test_events_end_with_the_job_and_resume_after_the_last_one(running: Running,
     assert http.get("/v1/jobs/nobody/events").status_code == 404
 
 
+def test_share_links_of_a_finished_job_are_no_events(running: Running, http: httpx.Client) -> None:
+    job = submit(http, name="often shared")
+    finish(running, job.id, b"x")
+    address = f"/v1/jobs/{job.id}"
+    before = http.get(f"{address}/events").text
+    for _ in range(EVENTS_KEPT_AT_LAST):
+        share = http.post(f"{address}/shares", json={}).json()
+        assert http.delete(f"{address}/shares/{share['id']}").status_code == 204
+    assert http.get(f"{address}/events", timeout=20).text == before
+    last = before.rpartition("id: ")[2].split()[0]
+    assert "data:" not in http.get(f"{address}/events", headers={"Last-Event-ID": last}, timeout=20).text
+
+
 def test_waiting_ends_with_the_job_or_its_time_limit(running: Running, http: httpx.Client) -> None:
     job = submit(http, name="awaited")
     begun = time.monotonic()
@@ -172,6 +185,11 @@ def test_an_unknown_query_parameter_is_refused(http: httpx.Client, address: str,
 @pytest.mark.parametrize("address", ["/healthz?probe=1", "/readyz?exclude=workers&probe=1", "/metrics?format=text"])
 def test_addresses_for_machines_accept_any_query_parameter(http: httpx.Client, address: str) -> None:
     assert http.get(address).status_code == 200
+
+
+def test_a_trailing_slash_is_no_redirect(http: httpx.Client) -> None:
+    answer = http.post("/v1/jobs/", headers={"X-Forwarded-Proto": "https"})
+    assert (answer.status_code, answer.json()["code"]) == (404, "no_such_address")
 
 
 def test_a_body_that_is_not_json_is_described(http: httpx.Client) -> None:

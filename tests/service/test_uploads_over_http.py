@@ -156,6 +156,9 @@ REFUSED: dict[str, tuple[dict[str, Any], bytes, int, str]] = {
     "other bytes": ({"Repr-Digest": repr_digest(b"y")}, b"x", 422, "digest_mismatch"),
     "odd digest": ({"Repr-Digest": "sha-256=:AAA:"}, b"x", 422, "invalid_digest"),
     "foreign digest": ({"Repr-Digest": "sha-256=:é:".encode("latin-1")}, b"x", 422, "invalid_digest"),
+    "hexadecimal digest": ({"Repr-Digest": hashlib.sha256(b"x").hexdigest()}, b"x", 422, "invalid_digest"),
+    "digest that is no byte sequence": ({"Repr-Digest": "sha-256=AAAA"}, b"x", 422, "invalid_digest"),
+    "digest in capitals": ({"Repr-Digest": repr_digest(b"x").upper()}, b"x", 422, "invalid_digest"),
     "short digest": ({"Repr-Digest": "sha-256=:AAAA:"}, b"x", 422, "invalid_digest"),
     "negative": ({"Upload-Offset": "-1"}, b"x", 422, "invalid_request"),
     "not a number": ({"Upload-Length": "many"}, b"x", 422, "invalid_request"),
@@ -175,6 +178,12 @@ def test_rejected_uploads_state_the_reason(small: Running, case: str) -> None:
     assert answer.headers["content-type"] == "application/problem+json"
     there = httpx.get(path)
     assert there.status_code == 404 or there.json()["complete"] is False
+
+
+def test_digests_of_other_algorithms_are_ignored(small: Running) -> None:
+    for number, digest in enumerate(("md5=:AAAA:", f"md5=:AAAA:, {repr_digest(b'x')}")):
+        answer = httpx.put(f"{small.url}/v1/uploads/other-{number}", content=b"x", headers={"Repr-Digest": digest})
+        assert answer.status_code == 201, answer.text
 
 
 def test_a_body_of_unknown_length_is_limited_too(small: Running) -> None:

@@ -176,8 +176,11 @@ class MemoryRecords(Records):
         """See `Records.ping`."""
 
     def _note(self, before: Stored | None, after: Stored) -> None:
+        event = event_of(before, after)
+        if event is None:
+            return
         self._clock += 1
-        name, data = event_of(before, after)
+        name, data = event
         events = self._events.setdefault(after.job.id, [])
         events.append(Event(f"{self._clock}-0", name, data))
         del events[: -events_kept(after)]

@@ -71,7 +71,7 @@ return false
 _FULL, _NO_SPACE = "!full", "!space"
 """Results of `_CREATE` when the owner's queue or the quota is full; ids never start with this character."""
 
-# ARGV: 1 prefix, 2 id, 3 version before, 4 version, 5 status, 6 attempt id, 7 bytes, 8 body, 9 event, 10 data, 11 cap,
+# ARGV: 1 prefix, 2 id, 3 version before, 4 version, 5 status, 6 attempt id, 7 bytes, 8 body, 9 event ('': none), 10 data, 11 cap,
 # 12 when the webhook is due ('': none), 13 … counters and their increments. A repetition after a lost reply succeeds, too.
 _REPLACE = """
 local at, job = ARGV[1], ARGV[1] .. 'job:' .. ARGV[2]
@@ -86,8 +86,10 @@ if held[2] ~= ARGV[5] then
   end
 end
 if held[5] ~= ARGV[7] then redis.call('INCRBY', at .. 'used', tonumber(ARGV[7]) - tonumber(held[5])) end
-redis.call('XADD', at .. 'events:' .. ARGV[2], 'MAXLEN', ARGV[11], '*', 'name', ARGV[9], 'data', ARGV[10])
-redis.call('PUBLISH', at .. 'changes', ARGV[2])
+if ARGV[9] ~= '' then
+  redis.call('XADD', at .. 'events:' .. ARGV[2], 'MAXLEN', ARGV[11], '*', 'name', ARGV[9], 'data', ARGV[10])
+  redis.call('PUBLISH', at .. 'changes', ARGV[2])
+end
 if ARGV[12] ~= '' then redis.call('ZADD', at .. 'outbox', ARGV[12], ARGV[2]) end
 for i = 13, #ARGV, 2 do redis.call('HINCRBYFLOAT', at .. 'tally', ARGV[i], ARGV[i + 1]) end
 return 1
@@ -141,7 +143,7 @@ class RedisRecords(Records):
         self._log = client.register_script(_LOG)
 
     def create(self, stored: Stored, *, max_queued: int = 0, max_bytes: int = 0) -> Stored:
-        name, data = event_of(None, stored)
+        name, data = event_of(None, stored) or ("", "")
         job = stored.job
         with reachable():
             taken = self._create(
@@ -178,7 +180,7 @@ class RedisRecords(Records):
             return None
 
     def replace(self, before: Stored, after: Stored) -> bool:
-        name, data = event_of(before, after)
+        name, data = event_of(before, after) or ("", "")
         job, due = after.job, webhook_due(before, after)
         with reachable():
             written = self._replace(

@@ -144,6 +144,6 @@ function curl(job: Job, chosen: Given, url: string): string {
     `${[`curl ${quote(`${url}/v1/jobs`)}`, ...fields].join(" \\\n  ")}\n\n` +
     `# this job's record, and its animated mesh\n` +
     `curl ${quote(`${url}/v1/jobs/${job.id}`)}\n` +
-    `curl -O ${quote(`${url}/v1/jobs/${job.id}/artifacts/shapes.glb`)}\n`
+    `curl --fail -O ${quote(`${url}/v1/jobs/${job.id}/artifacts/shapes.glb`)}\n`
   );
 }

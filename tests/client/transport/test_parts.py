@@ -13,7 +13,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from pliant.client import BadArgument, Client, NotLoaded, Options
+from pliant.client import BadArgument, Client, NotLoaded, Options, Retry, Unreachable
 from pliant.client.input_files import array_part, existing_file, film_file, mesh_part, region_part, tracks_file
 from pliant.client.multipart import Form, Inputs, checked_options
 from pliant.service.testing import InMemoryService
@@ -139,12 +139,49 @@ def test_a_region_can_be_an_array_or_a_file(inside: object, tmp_path: Path) -> N
         (lambda here: existing_file(POINTS, "film"), "film: expected the path of a file, got a value of type ndarray"),
         (lambda here: region_part(POINTS, here), r"region: expected the path .* of bool or uint8, got an array of shape \(4, 9, 2\)"),
         (lambda here: region_part(POINTS[0], here), r"dtype float32\. Convert it; a polygon is the option region_polygon"),
+        (lambda here: tracks_file(io.BytesIO(b"x"), None, here), "got a value of type BytesIO that is none"),
         (lambda here: region_part(object(), here), "region: expected an array of numbers or booleans"),
     ],
 )  # fmt: skip
 def test_invalid_inputs_are_rejected_before_anything_is_sent(make: Any, words: str, tmp_path: Path) -> None:
     with pytest.raises(BadArgument, match=words):
         make(tmp_path)
+
+
+def test_an_open_file_that_is_refused_can_still_be_read(tmp_path: Path) -> None:
+    path = tmp_path / "tracks.npz"
+    path.write_bytes(b"some bytes")
+    with path.open("rb") as file:
+        with pytest.raises(BadArgument, match="give files by their path"):
+            tracks_file(file, None, tmp_path)
+        assert file.read() == b"some bytes"
+
+
+def test_a_region_of_zeros_and_ones_is_a_mask(tmp_path: Path) -> None:
+    mask = np.zeros((6, 8), dtype=np.uint8)
+    mask[2:4, 3:6] = 1
+    assert read_region(region_part(mask, tmp_path), (8, 6)).sum() == 6
+    assert read_region(region_part(255 * mask, tmp_path), (8, 6)).sum() == 6
+
+
+@pytest.mark.parametrize("timeout", ["3", True, float("nan"), object()])
+def test_a_timeout_that_is_no_number_is_refused(timeout: Any) -> None:
+    with pytest.raises(BadArgument, match="timeout: expected seconds as a number"):
+        Client("http://pliant.test", transport=InMemoryService()).limits(timeout=timeout)
+
+
+def test_arguments_of_clients_and_submissions_are_checked() -> None:
+    client = Client("http://pliant.test", transport=InMemoryService(), token="")
+    assert client.limits(timeout=np.float32(20)).max_frames > 0
+    with pytest.raises(BadArgument, match="name: expected a str, got a value of type int"):
+        client.submit(POINTS, name=5)  # type: ignore[arg-type]
+    with pytest.raises(BadArgument, match="token: expected a str"):
+        Client("http://pliant.test", token=5)  # type: ignore[arg-type]
+    client.close()
+    with pytest.raises(BadArgument, match="The client is closed"):
+        client.limits()
+    with pytest.raises(Unreachable, match="at http://127.0.0.1:1:"):
+        Client("http://127.0.0.1:1", retries=Retry(first_contact=0)).limits()
 
 
 def test_options_are_a_record_or_a_mapping() -> None:

@@ -100,7 +100,7 @@ def artifact() -> Artifact:
 
 
 def attempts() -> Attempts:
-    return Attempts(retries=Retry(), contact=Contact())
+    return Attempts(retries=Retry(), contact=Contact(url="http://127.0.0.1"))
 
 
 @pytest.mark.usefixtures("memory")
