@@ -136,7 +136,8 @@ def region_part(region: Region, folder: Path) -> Path:
     from PIL import Image  # here, because it is not needed otherwise
 
     # A mask of 0 and 1, as segmentation models return it, or a picture of 0 to 255.
-    inside = mask if mask.dtype == bool else mask >= (1 if mask.max() == 1 else 128)
+    levels = np.asarray(mask, dtype=np.uint8)
+    inside = mask if mask.dtype == bool else levels >= (1 if levels.max() == 1 else 128)
     path = folder / "region.png"
     Image.fromarray(np.where(inside, 255, 0).astype(np.uint8)).save(path)
     return path

@@ -6,7 +6,7 @@ Nothing here needs SciPy, so a reader can refuse a job before it is queued.
 from __future__ import annotations
 
 import numpy as np
-from pliant.solver.errors import InvalidInput, InvalidSettings
+from pliant.solver.errors import InvalidInput, InvalidSettings, wrong_input
 from pliant.solver.limits import MAX_UNORDERED_FRAMES, frame_chunks
 from pliant.solver.mesh import Mesh
 from pliant.solver.records import MIN_POINTS, Floats, KnownCamera, Tracks
@@ -26,11 +26,12 @@ def check_agreement(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | No
     InvalidInput
         Number of vertices (code `mesh_mismatch`) or of cameras (`camera_mismatch`); cameras with a focal length while the settings have
         another one or an orthographic model (`camera_mismatch`); half or more of the observations outside `image_size`
-        (`outside_picture`).
+        (`outside_picture`); an argument of another type (`wrong_type`).
     InvalidSettings
         `laplacian="grid8"` with a mesh that is not a grid, `surface="isometric"` with given cameras, `camera="orthographic"` with given
         scales that are not 1, or `order="any"` with more than `MAX_UNORDERED_FRAMES` frames.
     """
+    _check_types(tracks, mesh, cameras, settings)
     check_mesh(tracks, mesh, settings)
     if cameras is not None:
         _check_cameras(tracks, cameras, settings)
@@ -41,6 +42,20 @@ def check_agreement(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | No
         )  # fmt: skip
     if settings.image_size is not None:
         _check_picture(tracks, settings.image_size)
+
+
+def _check_types(tracks: object, mesh: object, cameras: object, settings: object) -> None:
+    """Refuse plain arrays with the function that makes the expected record of them."""
+    for field, value, kind, make in (
+        ("tracks", tracks, Tracks, "Tracks.from_arrays(points, visible)"),
+        ("mesh", mesh, Mesh, "Mesh.from_faces(faces, num_points)"),
+        ("cameras", cameras, KnownCamera, "KnownCamera.from_arrays(rotations)"),
+        ("settings", settings, Settings, "Settings(…)"),
+    ):
+        if not isinstance(value, kind) and (field == "tracks" or value is not None):
+            raise wrong_input(
+                field, "wrong_type", f"a {kind.__name__}", f"a value of type {type(value).__name__}", f"Use {make}."
+            )
 
 
 def check_mesh(tracks: Tracks, mesh: Mesh | None, settings: Settings) -> None:

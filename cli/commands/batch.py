@@ -113,7 +113,7 @@ class Batch:
     rows: list[Row] = field(default_factory=list)
 
     def check(self, *, name: str, job_id: str | None, region: Path | None) -> None:
-        """Refuse options that are only valid for a single job, and create the output folders.
+        """Refuse options that are only valid for a single job, and create the output folder.
 
         Raises
         ------
@@ -137,8 +137,10 @@ class Batch:
             raise BadArgument(
                 f"--output: several files are named {twice}, and would share a folder. Submit them separately."
             )
+        made_folder(self.output, "--output")
         for each in names:
-            made_folder(self.output / each, "--output")
+            if (self.output / each).exists():  # the others are made for results only
+                made_folder(self.output / each, "--output")
 
     def run(self, client: Client) -> None:
         """Submit all files and, if requested, wait for the jobs.

@@ -10,6 +10,7 @@ from fastapi.responses import HTMLResponse, Response
 from pliant.schemas.job import Record
 from pliant.schemas.problems import ProblemCode
 from pliant.service.openapi import problems
+from pliant.service.problems import Refusal
 from pydantic import Field
 
 router = APIRouter(prefix="/errors", tags=["about"])
@@ -37,14 +38,17 @@ def error_codes() -> list[ErrorCode]:
     operation_id="get_error_code",
     summary="Explain an error code",
     response_model=ErrorCode,
-    responses={200: {"content": {"text/html": {"schema": {"type": "string"}}}}, **problems(404, 422)},
+    responses={200: {"content": {"text/html": {"schema": {"type": "string"}}}}, **problems(404)},
 )
 def error_code(
-    code: Annotated[ProblemCode, Path(description="The `code` of a problem.", examples=["unknown_job"])],
+    code: Annotated[str, Path(description="The `code` of a problem.", examples=["unknown_job"])],
     accept: Annotated[str, Header(description="`text/html` for a page, else JSON.")] = "",
 ) -> Response:
     """Return cause and remedy of an error code, as JSON or as a page for browsers."""
-    found = explain(code)
+    if code not in list(ProblemCode):
+        detail = "No error has this code. All codes are listed at /errors."
+        raise Refusal(ProblemCode.NO_SUCH_ADDRESS, detail=detail, got=code[:80])
+    found = explain(ProblemCode(code))
     headers = {"Cache-Control": "public, max-age=3600", "Vary": "Accept"}
     if "text/html" in accept:
         return HTMLResponse(page_of(found), headers=headers)

@@ -84,8 +84,9 @@ def test_reasons_of_refusals_are_complete_on_a_narrow_terminal(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "60")
     np.savez(takes / "short.npz", tracks=np.zeros((2, 12, 2)))
-    ran = run("submit", takes, "--mesh", "none")
+    ran = run("submit", takes, "--mesh", "none", "-o", takes / "out")
     assert ran.exit_code == Exit.FAILED
+    assert {each.name for each in (takes / "out").iterdir()} == {f"take-{number}" for number in range(3)}
     (line,) = [line for line in ran.stdout.splitlines() if line.startswith(str(takes / "short.npz"))]
     assert "expected at least 3 frames" in line
     assert "More about this error: http" in line

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from browsing import why_not
+from browsing import heard, why_not
 from paging import DONE, steps_of, until
 from playwright.sync_api import Page, Route, expect
 from pliant.client import Client
@@ -115,3 +115,39 @@ def test_a_token_is_requested_once_and_sent_with_every_request(page: Page, url: 
     with page.expect_download() as download:
         page.get_by_role("link", name="report.json").click()
     assert "metrics" in json.loads(Path(download.value.path()).read_text())
+
+
+def test_a_token_can_be_replaced_and_one_that_no_header_carries_is_not_taken(page: Page, url: str) -> None:
+    sent: list[str | None] = []
+
+    def guarded(route: Route) -> None:
+        sent.append(route.request.headers.get("authorization"))
+        if sent[-1] in ("Bearer one", "Bearer two"):
+            route.continue_()
+            return
+        problem = {"title": "Token required", "status": 401, "detail": "Send a token.", "code": "unauthorized"}
+        route.fulfill(status=401, content_type="application/problem+json", body=json.dumps(problem))
+
+    page.route("**/v1/**", guarded)
+    page.goto(url)
+    token, use = page.get_by_label("Token"), page.get_by_role("button", name="Use", exact=True)
+    another = page.get_by_role("button", name="Use another token")
+    expect(another).to_be_hidden()
+    token.fill("pliant_…")
+    use.click()
+    assert "only ASCII letters" in token.evaluate("(it) => it.validationMessage")
+    token.fill("one")
+    use.click()
+    expect(token).to_have_count(0)
+    another.click()
+    expect(token).to_be_focused()
+    heard(page, lambda: sent.count("Bearer one") > 3)  # answers do not close a form that a person opened
+    token.fill("two")
+    use.click()
+    expect(token).to_have_count(0)
+    heard(page, lambda: sent[-1] == "Bearer two")
+    another.click()
+    page.get_by_role("button", name="Forget the token").click()
+    expect(page.get_by_role("alert").first).to_contain_text("This service needs a token")
+    expect(another).to_be_hidden()
+    assert set(sent) == {None, "Bearer one", "Bearer two"}

@@ -162,7 +162,7 @@ def test_the_type_of_a_problem_resolves_to_its_explanation(http: httpx.Client) -
 
 def test_an_unknown_code_has_no_explanation(http: httpx.Client) -> None:
     answer = http.get("/errors/<b>")
-    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_request")
+    assert (answer.status_code, answer.json()["code"], answer.json()["got"]) == (404, "no_such_address", "<b>")
 
 
 def test_problems_accept_codes_of_newer_versions() -> None:

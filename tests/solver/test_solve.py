@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from pliant.solver import (
@@ -128,3 +130,19 @@ def test_overflow_is_an_error_not_a_result() -> None:
     settings = Settings(precision="float32", prior="smooth")
     with pytest.raises(NotFinite, match="float64"):
         solve(Tracks.from_arrays(points), mesh, cameras=cameras_of(rotations), settings=settings)
+
+
+@pytest.mark.parametrize(
+    ("field", "more", "make"),
+    [
+        ("tracks", {"tracks": np.zeros((5, 9, 2))}, "Tracks.from_arrays"),
+        ("mesh", {"mesh": [[0, 1, 2]]}, "Mesh.from_faces"),
+        ("cameras", {"cameras": np.eye(3)}, "KnownCamera.from_arrays"),
+        ("settings", {"settings": {"loss": "l1"}}, "Settings("),
+    ],
+)
+def test_plain_arrays_are_refused_with_the_record_to_make(field: str, more: dict[str, Any], make: str) -> None:
+    given: dict[str, Any] = {"tracks": gallery.face(5, 30).tracks, **more}
+    with pytest.raises(InvalidInput, match=make.replace("(", r"\(")) as caught:
+        solve(**given)
+    assert (caught.value.code, caught.value.field) == ("wrong_type", field)

@@ -45,6 +45,9 @@ class Child:
     ready: Callable[[subprocess.Popen[bytes]], None] | None = None
     """Returns once the process is ready; at start, the next process waits for it."""
 
+    last_words: Callable[[], str] | None = None
+    """Returns the last lines of its log, for the message that it ended."""
+
     foundation: bool = False
     """Stop this process only after all others, which depend on it."""
 
@@ -114,7 +117,10 @@ class Supervisor:
             elif (code := each.process.poll()) is not None:
                 each.pause = FIRST_PAUSE if now - each.began > GROWN_UP else min(2 * each.pause, LONGEST_PAUSE)
                 each.process, each.restart_at = None, now + each.pause
-                logger.warning("%s ended with code %s; starting it again in %.1f s", each.child.name, code, each.pause)
+                last = "" if each.child.last_words is None else each.child.last_words()
+                why = f". Its log ends with: {last}" if last else ""
+                name, again = each.child.name, f"Starting it again in {each.pause:.1f} s"
+                logger.warning("%s ended with code %s%s. %s", name, code, why, again)
 
     def stop(self) -> None:
         """Stop the children, foundations last; kill each one that outlives its grace period."""
@@ -163,6 +169,7 @@ def valkey_child(valkey: Valkey) -> Child:
         argv=valkey.argv,
         descriptors=(valkey.server_lock,),
         ready=valkey.wait,
+        last_words=valkey.log_tail,
         foundation=True,
         grace=15.0,
     )

@@ -20,6 +20,13 @@ const welcome = document.getElementById("welcome") as HTMLElement;
 const [said, gate] = [h("div", {}), h("div", {})];
 trouble.append(said, gate);
 
+/** Opens the token form, since a token can be accepted and still lack the scope for what one wants to do. */
+const another = button("Use another token", () => void askForToken(), { class: "quiet" });
+another.hidden = !hasToken();
+document.querySelector("header nav")?.append(another);
+/** Whether the user opened the token form, which then stays although the service answers. */
+let asked = false;
+
 const list = new JobList();
 const compose = new Compose((job: Job) => {
   list.update(job);
@@ -69,22 +76,37 @@ function report(error: unknown): void {
 /** Remove the error and the token form: the service has answered, or has a new token to judge. */
 function clear(): void {
   fill(said, "", () => []);
-  gate.replaceChildren();
+  if (!asked) gate.replaceChildren();
 }
+
+function askForToken(): void {
+  asked = true;
+  gate.replaceChildren(tokenForm());
+  gate.querySelector("input")?.focus();
+}
+
+/** Characters that a header can carry; with any other, every request would fail before it is sent. */
+const TOKEN = /^[\x21-\x7e]+$/;
 
 function tokenForm(): HTMLElement {
   const input = h("input", { type: "password", id: "token", autocomplete: "off", required: true });
   const form = h("form", { class: "row" }, h("label", { for: "token" }, "Token"), input, h("button", { type: "submit" }, "Use"));
   const use = (token: string): void => {
     setToken(token);
+    asked = false;
+    another.hidden = !hasToken();
     clear();
     show(named(), false);
     void start();
   };
-  if (hasToken()) form.append(button("Forget the rejected token", () => use(""), { class: "quiet" }));
+  if (hasToken()) form.append(button(asked ? "Forget the token" : "Forget the rejected token", () => use(""), { class: "quiet" }));
+  input.addEventListener("input", () => input.setCustomValidity(""));
   form.addEventListener("submit", (event) => {
     event.preventDefault();
-    use(input.value.trim());
+    const token = input.value.trim();
+    if (TOKEN.test(token)) return use(token);
+    input.setCustomValidity("A token has only ASCII letters, digits and signs. Copy it again.");
+    input.reportValidity();
   });
   return form;
 }
@@ -130,6 +152,7 @@ document.addEventListener(AGAIN, (event) => compose.again((event as CustomEvent<
 function alone(): void {
   setSingle();
   document.body.classList.add("shared");
+  another.hidden = true;
   welcome.hidden = true;
 }
 

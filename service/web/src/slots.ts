@@ -145,15 +145,22 @@ export class Slots {
     const rank = ([file, entries]: [File, Entry[]]): number =>
       looksLikeFilm(file, entries) ? 0 : looksLikeTracks(file, entries) && roleOf(file.name, entries, false) === "tracks" ? 1 : 2;
     const leftOut: string[] = [];
+    const replaced: string[] = [];
+    const taken = new Map<string, string>();
     for (const [file, entries] of read.sort((one, other) => rank(one) - rank(other))) {
       const part = this.placeOf(file, entries);
       if (part === null) leftOut.push(file.name);
       else if (part === "region") await this.filming.useMask(file);
       else await this.show(part, file);
       if (part === "tracks") await this.show("film", null); // the last drop wins
+      if (part === null) continue;
+      const place = part === "tracks" ? "film" : part;
+      const before = taken.get(place);
+      if (before !== undefined) replaced.push(before);
+      taken.set(place, file.name);
     }
     const folders = files.filter((_, index) => !readable[index]).map(({ name }) => name);
-    if (files.length > 0) await this.settle(leftOut, folders);
+    if (files.length > 0) await this.settle(leftOut, folders, replaced);
   }
 
   /** Return the part that a dropped file belongs to; null if it is of an unknown kind, or does not belong to a film. */
@@ -167,14 +174,18 @@ export class Slots {
   }
 
   /** Report the files that were left out; a picture chosen as a mesh before its film is the film's mask. */
-  private async settle(leftOut: string[] = [], folders: string[] = []): Promise<void> {
+  private async settle(leftOut: string[] = [], folders: string[] = [], replaced: string[] = []): Promise<void> {
     const [film, mesh] = [this.file("film"), this.file("mesh")];
     if (film && mesh && looksLikePicture(mesh)) {
       await this.show("mesh", null);
       await this.filming.useMask(mesh);
     }
     const belongs = film ? "Only a mask picture can be added to a film." : "This page does not know files of this kind.";
-    const reasons: [string[], string][] = [[leftOut, belongs], [folders, "A folder cannot be read: zip its pictures first."]];
+    const reasons: [string[], string][] = [
+      [leftOut, belongs],
+      [folders, "A folder cannot be read: zip its pictures first."],
+      [replaced, "A job has one film or one track file, and one file of every other kind."],
+    ];
     const told = reasons.filter(([names]) => names.length > 0).map(([names, why]) => `Left out: ${names.join(", ")}. ${why}`);
     say(this.leftOut, told.join(" "));
     this.onChange();

@@ -180,7 +180,7 @@ def test_arguments_of_clients_and_submissions_are_checked() -> None:
     client.close()
     with pytest.raises(BadArgument, match="The client is closed"):
         client.limits()
-    with pytest.raises(Unreachable, match="at http://127.0.0.1:1:"):
+    with pytest.raises(Unreachable, match=r"at http://127\.0\.0\.1:1:"):
         Client("http://127.0.0.1:1", retries=Retry(first_contact=0)).limits()
 
 

@@ -84,9 +84,12 @@ def test_a_file_that_does_not_belong_to_a_film_is_left_out(filming: Page, films:
     drop(filming, {"tracks.npz": packed(tracks=np.zeros((3, 4, 2)))})  # tracks replace the film
     expect(filming.get_by_text("Left out")).to_be_hidden()
     expect(filming.locator("[data-part=tracks]")).to_contain_text("tracks.npz")
+    drop(filming, {"film.webm": films["film.webm"], "other.npz": packed(tracks=np.zeros((3, 4, 2)))})
+    expect(filming.get_by_text("Left out: film.webm. A job has one film or one track file")).to_be_visible()
+    expect(filming.locator("[data-part=tracks]")).to_contain_text("other.npz")
     drop(filming, {"make.py": b"print()"})
     expect(filming.get_by_text("Left out: make.py. This page does not know files of this kind.")).to_be_visible()
-    expect(filming.locator("[data-part=tracks]")).to_contain_text("tracks.npz")
+    expect(filming.locator("[data-part=tracks]")).to_contain_text("other.npz")
 
 
 def test_a_film_job_is_run_again_with_its_region(filming: Page, url: str, finished: str) -> None:

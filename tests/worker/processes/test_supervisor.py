@@ -43,6 +43,15 @@ def gone(pid: int) -> bool:
 SLEEP = "import time; time.sleep(600)"
 
 
+def test_the_log_of_a_child_that_ended_is_quoted(caplog: pytest.LogCaptureFixture) -> None:
+    supervisor = Supervisor([python("short", "raise SystemExit(3)", last_words=lambda: "No space left on device")])
+    supervisor.start()
+    until(lambda: supervisor.look() or caplog.records)
+    words = "short ended with code 3. Its log ends with: No space left on device. Starting it again in"
+    assert words in caplog.records[-1].getMessage()
+    supervisor.stop()
+
+
 def test_ended_children_are_restarted_with_growing_pauses(tmp_path: Path) -> None:
     log = tmp_path / "starts"
     code = f"import time; open({str(log)!r}, 'a').write(f'{{time.monotonic()}}\\n')"
