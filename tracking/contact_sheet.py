@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from pliant.tracking.records import TrackedFilm
 
 COLUMNS = 3
 ACROSS = 20
@@ -15,25 +18,14 @@ ACROSS = 20
 TAIL = 6
 """Number of past frames of each track that are drawn."""
 
+QUALITY = 85
+"""JPEG quality of the sheet."""
+
 View = tuple[int, int, int, int]
 """A rectangle of the picture: first column and row, width and height in pixels of the film."""
 
 MARGIN = 0.15
 """Width of the surroundings that are shown on every side of the points, share of the points' extent."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sheet:
-    """Content of a contact sheet; see `TrackedFilm` for the arrays of the same names."""
-
-    thumbnails: NDArray[np.uint8]
-    thumbnail_frames: NDArray[np.int64]
-    tracks: NDArray[np.float32]
-    visibility: NDArray[np.bool_]
-    grid: NDArray[np.int32]
-    template: int
-    frame_times: NDArray[np.float64]
-    thumbnail_view: View
 
 
 def view_of(tracks: NDArray[np.float32], visible: NDArray[np.bool_], size: tuple[int, int]) -> View:
@@ -49,37 +41,37 @@ def view_of(tracks: NDArray[np.float32], visible: NDArray[np.bool_], size: tuple
     return int(start[0]), int(start[1]), int(extent[0]), int(extent[1])
 
 
-def draw_contact_sheet(sheet: Sheet, *, quality: int = 85) -> bytes:
+def draw_contact_sheet(film: TrackedFilm) -> bytes:
     """Draw visible points and their last steps over every thumbnail; return a JPEG.
 
     A point's colour encodes its position in the template, so that a surface point has the same colour in all pictures.
     """
-    frames = [int(frame) for frame in sheet.thumbnail_frames]
-    colours = _colours(sheet.tracks[sheet.template])
-    pictures = [_draw(picture, frame, sheet, colours) for picture, frame in zip(sheet.thumbnails, frames, strict=True)]
+    frames = [int(frame) for frame in film.thumbnail_frames]
+    colours = _colours(film.tracks[film.template])
+    pictures = [_draw(picture, frame, film, colours) for picture, frame in zip(film.thumbnails, frames, strict=True)]
     columns = min(COLUMNS, len(pictures))
     pictures += [np.zeros_like(pictures[0])] * (-len(pictures) % columns)
     rows = [np.hstack(pictures[start : start + columns]) for start in range(0, len(pictures), columns)]
     whole = cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR)
-    return bytes(cv2.imencode(".jpg", whole, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes())
+    return bytes(cv2.imencode(".jpg", whole, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes())
 
 
-def _draw(picture: NDArray[np.uint8], frame: int, sheet: Sheet, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _draw(picture: NDArray[np.uint8], frame: int, film: TrackedFilm, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
     canvas = picture.copy()
-    left, top, width, height = sheet.thumbnail_view
+    left, top, width, height = film.thumbnail_view
     scale = canvas.shape[1] / width, canvas.shape[0] / height
-    every = max(1, round(float(np.sqrt((sheet.grid >= 0).sum())) / ACROSS))
-    row, column = np.nonzero(sheet.grid >= 0)
-    chosen = np.sort(sheet.grid[row, column][(row % every == 0) & (column % every == 0)])
+    every = max(1, round(float(np.sqrt((film.grid >= 0).sum())) / ACROSS))
+    row, column = np.nonzero(film.grid >= 0)
+    chosen = np.sort(film.grid[row, column][(row % every == 0) & (column % every == 0)])
     rows = slice(max(0, frame - TAIL), frame + 1)
-    paths = np.clip((sheet.tracks[rows, chosen] - (left, top) + 0.5) * scale - 0.5, -1e4, 1e4)
-    seen = sheet.visibility[rows, chosen]
+    paths = np.clip((film.tracks[rows, chosen] - (left, top) + 0.5) * scale - 0.5, -1e4, 1e4)
+    seen = film.visibility[rows, chosen]
     for number in np.flatnonzero(seen[-1]):
         colour = tuple(int(level) for level in colours[chosen[number]])
         path = np.round(paths[seen[:, number], number] * 16).astype(np.int32)
         cv2.polylines(canvas, [path[:, None]], False, colour, 1, cv2.LINE_AA, 4)
         cv2.circle(canvas, tuple(int(value) for value in path[-1]), 22, colour, -1, cv2.LINE_AA, 4)
-    time = f"{sheet.frame_times[frame]:.2f} s"
+    time = f"{film.frame_times[frame]:.2f} s"
     for shade, width in ((0, 3), (255, 1)):
         cv2.putText(
             canvas, time, (6, canvas.shape[0] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (shade,) * 3, width, cv2.LINE_AA

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.tracking.contact_sheet import Sheet, View, draw_contact_sheet
+from pliant.tracking.contact_sheet import View, draw_contact_sheet
 
 Stage = Literal["read", "locate", "track"]
 
@@ -154,10 +154,6 @@ class TrackedFilm:
                 image_size=np.array(self.film.size),
             )
 
-    def contact_sheet(self, *, quality: int = 85) -> bytes:
+    def contact_sheet(self) -> bytes:
         """Draw the tracks over some frames, as one small JPEG picture."""
-        sheet = Sheet(
-            self.thumbnails, self.thumbnail_frames, self.tracks, self.visibility, self.grid, self.template,
-            self.frame_times, self.thumbnail_view,
-        )  # fmt: skip
-        return draw_contact_sheet(sheet, quality=quality)
+        return draw_contact_sheet(self)

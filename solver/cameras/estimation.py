@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.factorization import Upgrade, upgrades
 from pliant.solver.cameras.multistart import (
     CANDIDATES,
+    MULTISTART_FRAMES,
     Candidate,
     carried,
     depth,
-    frames_used,
-    gram_of,
     run_multistart,
     with_fixed_rotations,
 )
@@ -23,14 +22,11 @@ from pliant.solver.cameras.planar_ambiguity import is_planar, resolve_pose_signs
 from pliant.solver.cameras.scale import rigid_evidence, rigid_scales
 from pliant.solver.model.so3 import angles_between, start_at_identity
 from pliant.solver.monitor import enter
-from pliant.solver.records import Floats, KnownCamera, Step, read_only
+from pliant.solver.records import Floats, KnownCamera, read_only
 from pliant.solver.settings import Settings
 from pliant.solver.tracks.completion import Completed, Filling, complete
+from pliant.solver.tracks.frame_selection import every_nth, of_frames
 from pliant.solver.tracks.normalization import Normalized
-
-PROGRESS_SHARE = 0.03
-"""Fraction of progress reported at the end of this stage, besides the units counted by `should_stop`
-(`solver.monitor`)."""
 
 MIN_CAMERA_TURN = np.radians(10.0)
 """Largest rotation relative to the first frame, rad, below which the result carries a warning."""
@@ -121,7 +117,6 @@ def estimate_cameras(
     normalized: Normalized,
     settings: Settings,
     *,
-    on_step: Callable[[Step], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
     rank: int = 0,
 ) -> CameraEstimate:
@@ -133,29 +128,24 @@ def estimate_cameras(
         Centred tracks; hidden entries and gross outliers are filled first.
     settings : Settings
         `camera`, `basis_size`, `refine_rotations`, `seed`.
-    on_step : callable, optional
-        Called after completion and after every factorization; fractions run from 0 to `PROGRESS_SHARE`.
     should_stop : callable, optional
         Called between units of work; once it returns True, the best cameras so far are returned.
     rank : int
         Number of basis columns of the completion, from an earlier estimate of these tracks; 0 selects it.
     """
-    report, ordered = on_step if on_step is not None else _silent, settings.order != "any"
+    ordered = settings.order != "any"
     completed = complete(normalized, seed=settings.seed, rank=rank, should_stop=should_stop)
     enter(should_stop, "multistart")
-    report(Step("cameras", 0.4 * PROGRESS_SHARE))
     scales, scale_reason = rigid_evidence(completed.gram, settings)
     gram = completed.gram / np.outer(np.repeat(scales, 2), np.repeat(scales, 2))
-    used = frames_used(len(scales))
-    part = gram_of(gram, used)
-    factorized, entries = _factorized(
-        gram, part, used, _sizes(completed, settings), ordered=ordered, report=report, should_stop=should_stop
-    )
+    used = every_nth(len(scales), MULTISTART_FRAMES)
+    part = of_frames(gram, used)
+    sizes = _sizes(completed, settings)
+    factorized, entries = _factorized(gram, part, used, sizes, ordered=ordered, should_stop=should_stop)
     best, ran = min(entries, key=lambda candidate: candidate.energy), entries
     if settings.refine_rotations:
         best, ran = run_multistart(part, entries, ordered=ordered, should_stop=should_stop)
     own = {each.basis_size: each.rotations for each in factorized}
-    report(Step("cameras", 0.8 * PROGRESS_SHARE))
     rotations, refined = _everywhere(own[best.basis_size], best, used, settings)
     alternative = None
     if planar := settings.refine_rotations and is_planar(gram):
@@ -171,7 +161,6 @@ def estimate_cameras(
     )
     read_only(rotations)
     read_only(scales)
-    report(Step("cameras", PROGRESS_SHARE))
     reasons = {"basis_size": _why(ran, best, settings), "scales": scale_reason, "rotations": refined}
     return CameraEstimate(
         rotations, scales, completed.translations, best.basis_size, completed.gram, completed.sample,
@@ -183,11 +172,10 @@ def estimate_cameras(
 def _factorized(
     gram: Floats,
     part: Floats,
-    used: slice,
+    used: NDArray[np.intp],
     sizes: list[int],
     *,
     ordered: bool,
-    report: Callable[[Step], None],
     should_stop: Callable[[], bool] | None,
 ) -> tuple[list[Upgrade], list[Candidate]]:
     """Return the factorization for every K of `sizes`, and from each a multistart candidate at the frames used."""
@@ -197,7 +185,6 @@ def _factorized(
         factorized.append(each)
         thinned = Upgrade(each.basis_size, each.rotations[used], each.scales[used], each.residual)
         entries.append(with_fixed_rotations(part, thinned, ordered=ordered, should_stop=should_stop))
-        report(Step("cameras", (0.4 + 0.04 * len(entries)) * PROGRESS_SHARE))
         if should_stop is not None and should_stop():
             break
     return factorized, entries
@@ -220,7 +207,9 @@ def _from_factorization(size: int, rotations: Floats) -> OtherCameras:
     return OtherCameras(size, rotations, f"other rotations, from K = {size},")
 
 
-def _hypotheses(factorized: list[Upgrade], ran: list[Candidate], gram: Floats, used: slice) -> tuple[OtherCameras, ...]:
+def _hypotheses(
+    factorized: list[Upgrade], ran: list[Candidate], gram: Floats, used: NDArray[np.intp]
+) -> tuple[OtherCameras, ...]:
     """Return the cameras of factorizations with nearly the lowest energy after the first round and without excessive depth."""
     lowest = min((candidate.energy for candidate in ran), default=np.inf)
     near = {each.basis_size for each in ran if not each.smooth_start and each.energy <= lowest + MAX_HYPOTHESIS_GAP}
@@ -231,7 +220,7 @@ def _hypotheses(factorized: list[Upgrade], ran: list[Candidate], gram: Floats, u
     )
 
 
-def _everywhere(before: Floats, best: Candidate, used: slice, settings: Settings) -> tuple[Floats, str]:
+def _everywhere(before: Floats, best: Candidate, used: NDArray[np.intp], settings: Settings) -> tuple[Floats, str]:
     """Return the rotations of all frames, carried over from the frames of the multistart, and a sentence."""
     if not settings.refine_rotations:
         return before, "Rotations are those of the factorization."
@@ -316,7 +305,3 @@ def _warnings(rotations: Floats) -> tuple[str, ...]:
     if np.linalg.norm(directions - directions[0], axis=1).max() >= 2 * np.sin(MIN_CAMERA_TURN / 2):
         return ()
     return ("The camera hardly turns around the object: the tracks do not determine depth. Treat it as a guess.",)
-
-
-def _silent(_: Step) -> None:
-    pass

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.solver.cameras.factorization import Upgrade
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, Motion, Scene, cameras_of, fit, start
 from pliant.solver.model.so3 import exponential, logarithm, nearest
@@ -70,18 +71,6 @@ class Candidate:
     def cameras(self) -> tuple[Floats, Floats]:
         """Rotations and scales."""
         return cameras_of(self.scene, self.motion)
-
-
-def frames_used(count: int) -> slice:
-    """Return the frames that the multistart uses: every n-th of a long sequence."""
-    return slice(None, None, -(-count // MULTISTART_FRAMES))
-
-
-def gram_of(gram: Floats, used: slice) -> Floats:
-    """Return the Gram matrix of the frames used."""
-    frames = len(gram) // 2
-    blocks = gram.reshape(frames, 2, frames, 2)[used][:, :, used]
-    return np.ascontiguousarray(blocks).reshape(2 * len(blocks), 2 * len(blocks))
 
 
 def with_fixed_rotations(
@@ -159,7 +148,7 @@ def smooth_start(gram: Floats, candidate: Candidate, *, should_stop: Callable[[]
     return _entered(gram, turned, candidate.basis_size, smooth_start=True, ordered=True, should_stop=should_stop)
 
 
-def carried(rotations: Floats, best: Floats, used: slice) -> Floats:
+def carried(rotations: Floats, best: Floats, used: NDArray[np.intp]) -> Floats:
     """Return rotations of all frames, with the correction found at the frames used interpolated in between.
 
     Corrections are rotations of the world axes, so a rotation of the whole world needs no interpolation.
@@ -170,13 +159,13 @@ def carried(rotations: Floats, best: Floats, used: slice) -> Floats:
         Cameras of all frames, from the factorization.
     best : shape (F', 3, 3)
         Cameras of the frames used, refined.
-    used : slice
+    used : array of int
         The frames used.
     """
     turns = np.swapaxes(rotations[used], 1, 2) @ best
     common = nearest(turns.sum(axis=0))
     corrections = logarithm(turns @ common.T)
-    blended = between(np.arange(len(rotations))[used], corrections, len(rotations))
+    blended = between(used, corrections, len(rotations))
     return np.asarray(rotations @ exponential(blended) @ common)
 
 

@@ -21,11 +21,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.factorization import leading_factor
-from pliant.solver.cameras.multistart import carried, gram_of
+from pliant.solver.cameras.multistart import carried
 from pliant.solver.cameras.scale import rigid_scales
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, fit, start
 from pliant.solver.model.so3 import MIRROR, angles_between, from_rows, start_at_identity
 from pliant.solver.records import Floats, Tracks
+from pliant.solver.tracks.frame_selection import every_nth, of_frames
 from scipy.optimize import minimize
 
 PoseSigns = NDArray[np.bool_]
@@ -100,11 +101,6 @@ def on_one_line(tracks: Tracks) -> bool:
     return bool(flat) and sum(flat) > len(flat) / 2
 
 
-def planar_frames(count: int) -> slice:
-    """Return the frames that the search uses: every n-th of a long sequence."""
-    return slice(None, None, -(-count // PLANAR_FRAMES))
-
-
 def resolve_pose_signs(
     gram: Floats, rotations: Floats, *, ordered: bool = True, should_stop: Callable[[], bool] | None = None
 ) -> tuple[Floats, Floats | None, str]:
@@ -125,8 +121,8 @@ def resolve_pose_signs(
     should_stop : callable, optional
         Called between fits; once it returns True, the best so far is returned.
     """
-    used = planar_frames(len(rotations))
-    part, given = gram_of(gram, used), rotations[used]
+    used = every_nth(len(rotations), PLANAR_FRAMES)
+    part, given = of_frames(gram, used), rotations[used]
     planes, scales = poses(gram)
     starts = [(rotations, rigid_scales(part, given))]
     starts += [
@@ -202,9 +198,9 @@ def poses(gram: Floats) -> tuple[Floats, Floats]:
     return from_rows(rows), np.exp(np.log(values[:, 0]) - np.log(values[:, 0]).mean())
 
 
-def _of_all_frames(pose_signs: PoseSigns, used: slice, frames: int) -> PoseSigns:
+def _of_all_frames(pose_signs: PoseSigns, used: NDArray[np.intp], frames: int) -> PoseSigns:
     """Return the pose signs of all frames, repeated from the frames used, shape `(F,)`."""
-    return np.asarray(np.repeat(pose_signs, used.step)[:frames], dtype=bool)
+    return np.asarray(np.repeat(pose_signs, np.diff(used, append=frames)), dtype=bool)
 
 
 def reversed_at(rotations: Floats, plane: Floats, pose_signs: PoseSigns) -> Floats:

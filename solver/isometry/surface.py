@@ -61,17 +61,6 @@ FEWEST_ANCHORS = 6
 """Minimum number of anchors of a surface, in total and per frame."""
 
 
-@dataclass(frozen=True, slots=True)
-class FocalCandidate:
-    """A focal length that was tried."""
-
-    focal: float
-    """Pixels."""
-
-    inconsistency: float
-    """Isometric inconsistency I."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class IsometricVerdict:
     """Whether the tracks show an isometric surface, and the surface if they do."""
@@ -79,8 +68,8 @@ class IsometricVerdict:
     reason: str
     """Sentences for the report."""
 
-    candidates: tuple[FocalCandidate, ...] = ()
-    """Focal lengths in the order in which they were tried."""
+    focal_lengths: tuple[tuple[float, float], ...] = ()
+    """Focal lengths in the order in which they were tried, pixels, each with its inconsistency I."""
 
     surface: IsometricSurface | None = None
     """None if isometry is rejected."""
@@ -352,5 +341,5 @@ def _warnings(doubt: str | None, focal: float | None, least: Tried, chosen: Trie
     return tuple(warnings)
 
 
-def _trace(tried: list[Tried]) -> tuple[FocalCandidate, ...]:
-    return tuple(FocalCandidate(each.focal, each.found.inconsistency) for each in tried)
+def _trace(tried: list[Tried]) -> tuple[tuple[float, float], ...]:
+    return tuple((each.focal, each.found.inconsistency) for each in tried)

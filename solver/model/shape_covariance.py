@@ -83,16 +83,20 @@ class ShapeCovariance:
         deformed = self.modes @ (self.modes.T @ columns)
         return np.asarray(deformed + self.walk_variance * walked(columns, self.ordered))
 
-    def of_image(self, projections: Floats, used: NDArray[np.intp] | None = None) -> Floats:
-        """Return V = ΠΣΠᵀ + σ²I, shape `(2F, 2F)`; `projections` (F, 2, 3) are s_f times the first two rows of R_f.
+    def of_exact_image(self, projections: Floats, used: NDArray[np.intp] | None = None) -> Floats:
+        """Return ΠΣΠᵀ, shape `(2F, 2F)`; `projections` (F, 2, 3) are s_f times the first two rows of R_f.
 
         With `used`, both cover these frames only.
         """
         rows = projections.reshape(-1, 3)
         over_frames = self.over_frames() if used is None else self.over_frames_at(used)
         wide = np.repeat(np.repeat(over_frames, 2, axis=0), 2, axis=1)
-        image: Floats = rows @ self.mean_covariance @ rows.T + (rows @ self.axis_covariance @ rows.T) * wide
-        image[np.diag_indices(len(rows))] += self.noise_variance
+        return np.asarray(rows @ self.mean_covariance @ rows.T + (rows @ self.axis_covariance @ rows.T) * wide)
+
+    def of_image(self, projections: Floats, used: NDArray[np.intp] | None = None) -> Floats:
+        """Return V = ΠΣΠᵀ + σ²I; arguments as for `of_exact_image`."""
+        image = self.of_exact_image(projections, used)
+        image[np.diag_indices(len(image))] += self.noise_variance
         return image
 
     def image_model(self, projections: Floats) -> ImageModel:

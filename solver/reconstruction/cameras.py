@@ -199,8 +199,7 @@ def _without_shapes(observations: Observations, monitor: Monitor, rank: int = 0)
             perspective=observations.lens is not None,
             should_stop=monitor,
         )
-    on_step = None if rank else monitor.report
-    return estimation.estimate_cameras(normalized, settings, on_step=on_step, should_stop=monitor, rank=rank)
+    return estimation.estimate_cameras(normalized, settings, should_stop=monitor, rank=rank)
 
 
 def camera_of(estimate: CameraEstimate, observations: Observations) -> Camera:

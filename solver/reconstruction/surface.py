@@ -92,8 +92,5 @@ def with_verdict(solution: Solution, verdict: IsometricVerdict, settings: Settin
         warnings = (*warnings, f"The surface was not accepted as isometric and is solved as free. {verdict.reason}")
     elif trust is None or trust.verdict is not Verdict.GOOD:
         warnings = (*warnings, *verdict.warnings)
-    tried = tuple((each.focal, each.inconsistency) for each in verdict.candidates)
-    choices = replace(
-        choices, reasons={**choices.reasons, "surface": verdict.reason}, warnings=warnings, focal_lengths=tried
-    )
-    return replace(solution, choices=choices)
+    reasons, tried = {**choices.reasons, "surface": verdict.reason}, verdict.focal_lengths
+    return replace(solution, choices=replace(choices, reasons=reasons, warnings=warnings, focal_lengths=tried))

@@ -101,7 +101,8 @@ def held_out_error(
     weights = np.where(weights < LEAST_CONFIDENCE, 0.0, weights)
     images = _corrected(tracks.points[:, chosen], shapes[:, chosen], camera)[used] / unit
     try:
-        errors = _errors(_image_covariance(covariance, camera, used), noise_std(covariance) ** 2, images, weights)
+        image = covariance.of_exact_image((camera.scales[:, None, None] * camera.rotations[:, :2])[used], used)
+        errors = _errors(image, noise_std(covariance) ** 2, images, weights)
     except np.linalg.LinAlgError:
         return None
     seen = weights > 0
@@ -139,13 +140,6 @@ def _corrected(points: Floats, shapes: Floats, camera: Camera) -> Floats:
     if camera.focal is not None:
         off *= (1 + camera.depths(shapes) / camera.focal)[..., None]
     return np.asarray(flat + off)
-
-
-def _image_covariance(covariance: ShapeCovariance, camera: Camera, used: NDArray[np.intp]) -> Floats:
-    """Return Π Σ Πᵀ of the frames used, shape `(2F', 2F')`."""
-    rows = (camera.scales[:, None, None] * camera.rotations[:, :2])[used].reshape(-1, 3)
-    wide = np.repeat(np.repeat(covariance.over_frames_at(used), 2, axis=0), 2, axis=1)
-    return np.asarray(rows @ covariance.mean_covariance @ rows.T + (rows @ covariance.axis_covariance @ rows.T) * wide)
 
 
 def _blocks(seen: NDArray[np.intp], frames: int) -> list[NDArray[np.intp]]:

@@ -137,5 +137,5 @@ def _choices(verdict: IsometricVerdict, surface: IsometricSurface, unit: float, 
     return Choices(
         basis_size=0, temporal_weight=0.0, spatial_weight=0.0, robust_scale=0.0, temporal_order=1, low_rank_weight=0.0,
         laplacian="none", unit=unit, noise=surface.noise_std, reasons=reasons, warnings=tuple(warnings),
-        camera="perspective", depth_sign="settled", focal_lengths=tuple((each.focal, each.inconsistency) for each in verdict.candidates),
+        camera="perspective", depth_sign="settled", focal_lengths=verdict.focal_lengths,
     )  # fmt: skip

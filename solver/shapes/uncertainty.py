@@ -190,18 +190,12 @@ def bounded_by_neighbours(std: Floats, shapes: Floats, visible: Floats) -> Float
 
 def _moments(covariance: ShapeCovariance, projections: Floats, used: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
     """Return tr Σ_ff `(F,)`, Σ Πᵀ `(3F, 2F)` and Π Σ Πᵀ `(2F, 2F)` for the frames used."""
-    rows = projections[used].reshape(-1, 3)
-    if len(used) == len(projections):
-        over_frames = covariance.over_frames()
-    else:
-        over_frames = covariance.over_frames_at(used)
-    mean = rows @ covariance.mean_covariance
-    path = rows @ covariance.axis_covariance
+    rows, over_frames = projections[used].reshape(-1, 3), covariance.over_frames_at(used)
+    mean, path = rows @ covariance.mean_covariance, rows @ covariance.axis_covariance
     wide = np.repeat(over_frames, 2, axis=1)
     crossed = (mean.T[None, :, :] + path.T[None, :, :] * wide[:, None, :]).reshape(3 * len(used), -1)
-    image = mean @ rows.T + (path @ rows.T) * np.repeat(wide, 2, axis=0)
     prior = np.trace(covariance.mean_covariance) + np.diag(over_frames) * np.trace(covariance.axis_covariance)
-    return np.asarray(prior), crossed, np.asarray(image)
+    return np.asarray(prior), crossed, covariance.of_exact_image(projections[used], used)
 
 
 def _variance(prior: Floats, crossed: Floats, image: Floats, weights: Floats, noise: float) -> Floats:

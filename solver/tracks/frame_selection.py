@@ -19,6 +19,11 @@ def evenly_spread(total: int, count: int) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, total - 1, min(total, count)).round().astype(np.intp))
 
 
+def every_nth(count: int, most: int) -> NDArray[np.intp]:
+    """Return the indices 0, n, 2n, … below `count`, with the smallest n that leaves at most `most` of them."""
+    return np.arange(0, count, -(-count // most))
+
+
 def of_frames(gram: Floats, used: NDArray[np.intp]) -> Floats:
     """Return the rows and columns of a Gram matrix that belong to the frames `used`, shape `(2F', 2F')`."""
     rows = np.stack([2 * used, 2 * used + 1], axis=1).ravel()

@@ -120,9 +120,7 @@ def test_the_same_seed_gives_the_same_bits_and_stopping_returns() -> None:
     normalized = normalize(Tracks.from_arrays(view(RIGID, CAMERA)))
     first, second = estimate_cameras(normalized, Settings()), estimate_cameras(normalized, Settings())
     assert (first.rotations == second.rotations).all()
-    steps: list[float] = []
-    estimate_cameras(normalized, Settings(), on_step=lambda step: steps.append(step.fraction), should_stop=lambda: True)
-    assert steps == sorted(steps)
+    assert np.isfinite(estimate_cameras(normalized, Settings(), should_stop=lambda: True).rotations).all()
     assert estimate_cameras(normalized, Settings(basis_size=2)).basis_size == 2
 
 
@@ -174,7 +172,7 @@ def test_the_camera_motion_prior_penalises_changes_of_velocity_only() -> None:
 
 
 def test_corrections_are_carried_to_the_frames_between() -> None:
-    truth, used = turning(41, 60), slice(None, None, 4)
+    truth, used = turning(41, 60), np.arange(0, 41, 4)
     world = exponential(np.array([0.3, -2.0, 0.4]))
     drift = np.linspace(0, 0.3, 41)[:, None] * np.array([0.0, 1.0, 0.0])
     found = carried(truth @ exponential(-drift), (truth @ world)[used], used)

@@ -183,7 +183,7 @@ def test_a_cone_is_recovered_with_the_focal_length_known() -> None:
     assert verdict.surface is not None, verdict.reason
     assert one_scale_error(verdict.surface.points, sheet.points) < 0.08
     assert verdict.surface.principal_point == CENTRE
-    assert verdict.candidates[0].focal == FOCAL == verdict.surface.focal
+    assert verdict.focal_lengths[0][0] == FOCAL == verdict.surface.focal
 
 
 @pytest.mark.slow
