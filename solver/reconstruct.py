@@ -101,7 +101,7 @@ def _solved(
     began = time.perf_counter()
     observations = observe(tracks, known, settings)
     verdict = isometric_verdict(tracks, known, settings, monitor)
-    if verdict is not None and verdict.surface is not None:
+    if verdict is not None and verdict.surface is not None and not verdict.weak:
         return solution_of(tracks, verdict, settings, monitor, began=began)
     cameras, prior = _learned(observations, monitor)
     monitor.report(Step("cameras", 0.0, max_reweightings=settings.max_reweightings))
@@ -118,7 +118,7 @@ def _solved(
         start = _started(tracks, cameras, prior, mesh, settings, monitor, seconds)
         solution = shapes_from(start, monitor, seconds=seconds)
     solution = in_world_unit(solution, observations.world_scale)
-    return solution if verdict is None else with_verdict(solution, verdict, settings)
+    return solution if verdict is None else with_verdict(solution, tracks, verdict, settings, monitor, began=began)
 
 
 def _started(

@@ -1,4 +1,4 @@
-"""Search for the focal length by the isometric inconsistency, and the criterion for accepting isometry.
+"""Search for the focal length by the isometric inconsistency, and the criteria for accepting isometry.
 
 The inconsistency I is the relative change of the edge lengths from frame to frame. As a function of the focal length, it has its minimum at
 the true one if perspective is strong enough; otherwise it is flat, large or monotone. Each focal length starts from the depths of a
@@ -26,6 +26,10 @@ CLEAR = 1.25
 RISE = 0.002
 """Minimum increase of I at the neighbouring focal lengths. Measured: paper and page .003 to .006; a shallow face seen without perspective,
 which a false focal length can make isometric, at most .0008."""
+
+HINT = 1.03
+"""The same ratio below which a minimum is no evidence at all. Between it and `CLEAR`, or with a smaller increase than `RISE`, the minimum
+is weak evidence, which `confirmation` weighs."""
 
 DIP = 0.8
 """Minimum ratio of I to its running maximum with growing distance from the minimum: several minima are no evidence."""
@@ -183,8 +187,22 @@ def _carried(depths: Floats, seen: NDArray[np.bool_], ratio: float) -> Floats:
     return np.where(seen, np.maximum(ratio * mean + (depths - mean), 0.05 * ratio * mean), 0.0)
 
 
-def judged(tried: list[Tried], least: Tried) -> tuple[bool, str]:
-    """Return whether I is small and clearly smaller than at the neighbouring focal lengths, with a sentence; else a clause why not."""
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """The evidence for isometry in the focal lengths tried."""
+
+    ratio: float
+    """I at the neighbouring focal lengths divided by its minimum; 0 if the minimum is no evidence."""
+
+    clear: bool
+    """Whether the minimum is evidence by itself."""
+
+    words: str
+    """A sentence if it is evidence, else a clause why it is not."""
+
+
+def judged(tried: list[Tried], least: Tried) -> Judgement:
+    """Return whether I is small and smaller than at the neighbouring focal lengths."""
     value = least.found.inconsistency
     sides = [
         min((t.found.inconsistency for t in tried if (t.focal - least.focal) * side > 0
@@ -193,13 +211,14 @@ def judged(tried: list[Tried], least: Tried) -> tuple[bool, str]:
     ]  # fmt: skip
     ratio = min(sides) / value if value > 0 else np.inf
     if value > MAX_INCONSISTENCY:
-        return False, f"its edge lengths change by {value:.1%} or more, whatever the focal length"
-    if not (ratio >= CLEAR and min(sides) - value >= RISE and _single(tried, least)):
-        return False, "its edge lengths do not single out a focal length"
-    return True, (
+        return Judgement(0.0, False, f"its edge lengths change by {value:.1%} or more, whatever the focal length")
+    if not (ratio >= HINT and _single(tried, least)):
+        return Judgement(0.0, False, "its edge lengths do not single out a focal length")
+    words = (
         f"Taken as an isometric sheet: at a focal length of {least.focal:.0f} px edge lengths change by {value:.2%}, "
-        f"{ratio:.1f} times as much at neighbouring focal lengths."
+        f"{ratio:.3g} times as much at neighbouring focal lengths."
     )
+    return Judgement(ratio, ratio >= CLEAR and min(sides) - value >= RISE, words)
 
 
 def _single(tried: list[Tried], least: Tried) -> bool:

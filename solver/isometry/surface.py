@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.anchors import choose_anchors, connected, nearest_neighbours, unlike_frames
-from pliant.solver.isometry.confirmation import DISAGREEMENT, deformation, disagreement
+from pliant.solver.isometry.confirmation import DECISIVE, DISAGREEMENT, deformation, disagreement
 from pliant.solver.isometry.extension import Extended, complete_anchors, extend, flatten
-from pliant.solver.isometry.focal_sweep import CLEAR, FocalSearch, Tried, judged, least_of, sweep
+from pliant.solver.isometry.focal_sweep import CLEAR, FocalSearch, Judgement, Tried, judged, least_of, sweep
 from pliant.solver.isometry.homographies import off_homography
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import Isometry, edge_lengths, inconsistency, refine, typical
@@ -76,6 +76,9 @@ class IsometricVerdict:
 
     warnings: tuple[str, ...] = ()
     """Warnings for the user."""
+
+    weak: bool = False
+    """Whether the evidence decides only between this surface and a free one that differs from it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,22 +152,20 @@ def isometric_surface(
     if not tried:
         return IsometricVerdict("No isometric surface was found: the conic program has no solution.", _trace(tried))
     least = least_of(tried)
-    clear, why = judged(tried, least)
-    chosen = least if focal is None else tried[0]
-    if clear:
-        clear, why = _confirmed(search, chosen, why)
-    if not clear and not required:
+    judgement, chosen = judged(tried, least), least if focal is None else tried[0]
+    supported, why = _confirmed(search, chosen, judgement) if judgement.ratio > 0 else (False, judgement.words)
+    if not supported and not required:
         advice = "If it is one that keeps its lengths, such as paper or cloth seen from nearby, try surface=isometric and compare."
         return IsometricVerdict(f"Rejected as an isometric sheet: {why}. {advice}", _trace(tried))
-    warnings = _warnings(None if clear else why, focal, least, chosen)
-    if not clear:
+    warnings = _warnings(None if supported else why, focal, least, chosen)
+    if not supported:
         why = f"Solved as an isometric sheet, as set, although {why}."
     surface = _everywhere(search, tracks, seen, chosen)
     if surface is None:
         return IsometricVerdict("No isometric surface was found: its points are not connected.", _trace(tried))
     if not required and (rigid := _rigid(search, surface)) is not None:
         return IsometricVerdict(rigid, _trace(tried))
-    return IsometricVerdict(why, _trace(tried), surface, warnings)
+    return IsometricVerdict(why, _trace(tried), surface, warnings, weak=not (judgement.clear or required))
 
 
 def sheetlike(tracks: Tracks) -> float | None:
@@ -196,13 +197,18 @@ def _implausible(search: FocalSearch | None, focal: float, required: bool) -> st
     )
 
 
-def _confirmed(search: FocalSearch, chosen: Tried, why: str) -> tuple[bool, str]:
-    """Return whether halves of the frames lead to the same edge lengths, with a sentence; else a clause why not."""
+def _confirmed(search: FocalSearch, chosen: Tried, judgement: Judgement) -> tuple[bool, str]:
+    """Return whether halves of the frames lead to the same edge lengths, with a sentence; else a clause why not.
+
+    The weaker the evidence of the focal lengths, the better they must agree.
+    """
     share = disagreement(search, chosen)
-    if share > DISAGREEMENT:
-        change = "by more than their length" if share > 1 else f"by {share:.0%}"
-        return False, f"its edge lengths differ {change} between halves of the frames"
-    return True, f"{why} Halves of the frames agree on the lengths to within {share:.1%}."
+    if share <= (DISAGREEMENT if judgement.clear else (judgement.ratio - 1) / DECISIVE):
+        return True, f"{judgement.words} Halves of the frames agree on the lengths to within {share:.1%}."
+    if not judgement.clear and share <= DISAGREEMENT:
+        return False, "its edge lengths hardly single out a focal length"
+    change = "by more than their length" if share > 1 else f"by {share:.0%}"
+    return False, f"its edge lengths differ {change} between halves of the frames"
 
 
 def _rigid(search: FocalSearch, surface: IsometricSurface) -> str | None:

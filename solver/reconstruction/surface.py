@@ -6,16 +6,24 @@ import time
 from dataclasses import replace
 
 import numpy as np
+from pliant.solver.evaluation.metrics import e3d_frame_scaled
 from pliant.solver.evaluation.trust import Verdict
 from pliant.solver.isometry.surface import IsometricVerdict, isometric_surface, sheetlike
 from pliant.solver.monitor import Monitor
 from pliant.solver.reconstruction.unused_settings import without_effect
-from pliant.solver.records import KnownCamera, Step, Tracks
+from pliant.solver.records import Floats, KnownCamera, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.inliers import with_inlier_probability
 from pliant.solver.shapes.isometric_solution import centre_downwards, downwards, isometric_solution
 from pliant.solver.solution import Solution
 from pliant.solver.tracks.normalization import normalize
+
+UNLIKE = 0.1
+"""Minimum relative difference of the free surface from an isometric one with weak evidence for the latter to be taken. If they are alike,
+the free one is, since it need not keep lengths: on a made-up sheet that tears its error is .003, and .06 as an isometric surface."""
+
+COMPARED_POINTS = 2000
+"""Approximate number of points with which they are compared."""
 
 
 def tries_isometry(cameras: KnownCamera | None, settings: Settings) -> bool:
@@ -81,16 +89,35 @@ def solution_of(
     return solution
 
 
-def with_verdict(solution: Solution, verdict: IsometricVerdict, settings: Settings) -> Solution:
-    """Return the solution of a free surface with the reason for it.
+def with_verdict(
+    free: Solution, tracks: Tracks, verdict: IsometricVerdict, settings: Settings, monitor: Monitor, *, began: float
+) -> Solution:
+    """Return the solution of a free surface with the verdict on an isometric one, or that of the latter if it is more probable.
 
-    A warning is added if an isometric surface was required. The warnings of the verdict are added if the solution is not good.
+    A warning is added if an isometric surface was required. The warnings of the verdict are added if the free solution is not good.
     """
-    choices, trust = solution.choices, solution.trust
+    if verdict.surface is not None:
+        unlike = _unlike(free.shapes, verdict.surface.points)
+        if unlike >= UNLIKE:
+            warned = replace(verdict, warnings=(*verdict.warnings, _weak_evidence_warning(unlike)))
+            return solution_of(tracks, warned, settings, monitor, began=began)
+        reason = f"Solved as a free surface, which differs from an isometric one by only {unlike:.1%} of its size."
+        verdict = IsometricVerdict(reason, verdict.focal_lengths)
+    choices, trust = free.choices, free.trust
     warnings = choices.warnings
     if settings.surface == "isometric":
         warnings = (*warnings, f"The surface was not accepted as isometric and is solved as free. {verdict.reason}")
     elif trust is None or trust.verdict is not Verdict.GOOD:
         warnings = (*warnings, *verdict.warnings)
     reasons, tried = {**choices.reasons, "surface": verdict.reason}, verdict.focal_lengths
-    return replace(solution, choices=replace(choices, reasons=reasons, warnings=warnings, focal_lengths=tried))
+    return replace(free, choices=replace(choices, reasons=reasons, warnings=warnings, focal_lengths=tried))
+
+
+def _unlike(free: Floats, isometric: Floats) -> float:
+    """Return the relative difference of two sequences of shapes `(F, P, 3)`, each of which may be mirrored."""
+    some = slice(None, None, max(1, free.shape[1] // COMPARED_POINTS))
+    return e3d_frame_scaled(free[:, some], isometric[:, some])
+
+
+def _weak_evidence_warning(unlike: float) -> str:
+    return f"The evidence for constant lengths is weak, and a free surface differs by {unlike:.0%} of the size. Compare with surface=free."

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from pliant.solver import Tracks, gallery
+from pliant.solver import Settings, Tracks, gallery, solve
+from pliant.solver.evaluation.trust import Verdict
 from pliant.solver.isometry import surface
 from pliant.solver.isometry.confirmation import DISAGREEMENT, disagreement, unlike
-from pliant.solver.isometry.focal_sweep import FocalSearch, Tried, tried_at
+from pliant.solver.isometry.focal_sweep import FocalSearch, Judgement, Tried, tried_at
 from pliant.solver.isometry.refinement import refine
 from pliant.solver.isometry.surface import isometric_surface
-from rolled_sheets import CENTRE, FOCAL, SIZE, rolled
+from pliant.solver.monitor import Monitor
+from pliant.solver.reconstruction.surface import with_verdict
+from pliant.solver.stages import Stage
+from rolled_sheets import CENTRE, FOCAL, SIZE, one_scale_error, rolled
 
 
 def search_of(tracks: Tracks) -> FocalSearch:
@@ -54,6 +59,49 @@ def test_a_surface_that_the_halves_do_not_confirm_is_rejected(monkeypatch: pytes
     assert required.surface is not None
     assert required.reason == f"Solved as an isometric sheet, as set, although {why}."
     assert any("hardly support" in warning for warning in required.warnings)
+
+
+@pytest.mark.parametrize(
+    ("clear", "ratio", "share", "supported", "words"),
+    [
+        (True, 1.3, 0.019, True, "Halves of the frames agree on the lengths to within 1.9%."),
+        (True, 1.3, 0.021, False, "its edge lengths differ by 2% between halves of the frames"),
+        (False, 1.08, 0.009, True, "to within 0.9%."),
+        (False, 1.08, 0.011, False, "its edge lengths hardly single out a focal length"),
+        (False, 1.08, 0.4, False, "its edge lengths differ by 40% between halves of the frames"),
+        (False, 9.0, np.inf, False, "its edge lengths differ by more than their length between halves"),
+    ],
+)
+def test_weaker_evidence_needs_halves_that_agree_better(
+    clear: bool, ratio: float, share: float, supported: bool, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(surface, "disagreement", lambda search, chosen: share)
+    unused: Any = None
+    found, why = surface._confirmed(unused, unused, Judgement(ratio, clear, "Taken."))
+    assert found is supported
+    assert words in why
+
+
+@pytest.mark.slow
+def test_weak_evidence_decides_only_against_a_free_surface_that_differs() -> None:
+    sheet = rolled(frames=6, side=7)
+    accepted = isometric_surface(sheet.tracks, focal=FOCAL, image_size=SIZE)
+    weak = replace(accepted, weak=True)
+    settings = Settings(prior="smooth", refine_rotations=False, max_reweightings=1)
+    free = solve(sheet.tracks, settings=settings)
+    alike = replace(free, shapes=sheet.points - sheet.points.mean(axis=1, keepdims=True))
+    monitor = Monitor(None, plan=[Stage("finish", 1.0, 1)])
+    kept = with_verdict(alike, sheet.tracks, weak, Settings(), monitor, began=0.0)
+    assert kept.shapes is alike.shapes
+    assert kept.choices.reasons["surface"].startswith("Solved as a free surface, which differs")
+    assert kept.choices.focal_lengths == weak.focal_lengths
+    flat = replace(alike, shapes=alike.shapes * (1, 1, 0))
+    chosen = with_verdict(flat, sheet.tracks, weak, Settings(), monitor, began=0.0)
+    assert one_scale_error(chosen.shapes, sheet.points) < 0.015
+    assert chosen.choices.reasons["surface"].startswith("Taken as an isometric sheet")
+    assert chosen.trust is not None
+    assert chosen.trust.verdict is Verdict.WITH_CARE
+    assert "Compare with surface=free." in chosen.trust.reasons[0]
 
 
 def test_fewer_than_two_frames_per_half_confirm_nothing() -> None:

@@ -104,7 +104,7 @@ def test_the_focal_sweep_finds_a_minimum_and_tries_its_neighbours(monkeypatch: p
     tried = focal_sweep.sweep(SEARCH, 0.8 * DIAGONAL, DIAGONAL, given=False)
     least = focal_sweep.least_of(tried)
     assert least.focal == pytest.approx(true * DIAGONAL, rel=0.05)
-    assert focal_sweep.judged(tried, least)[0]
+    assert focal_sweep.judged(tried, least).clear
 
 
 @pytest.mark.parametrize("given", [0.1, 0.15, 7.0, 20.0])
@@ -133,14 +133,37 @@ def test_no_minimum_is_refined_that_would_not_be_accepted(monkeypatch: pytest.Mo
     steps = np.log(np.array(focals) / focals[0]) / np.log(focal_sweep.FOCAL_STEP)
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
     verdict = focal_sweep.judged(tried, focal_sweep.least_of(tried))
-    assert verdict == (False, "its edge lengths do not single out a focal length")
+    assert not verdict.clear
 
 
 def test_lengths_that_change_at_every_focal_length_are_not_those_of_a_sheet(monkeypatch: pytest.MonkeyPatch) -> None:
     with_inconsistencies(monkeypatch, lambda focal: 0.05 + 0.02 * float(np.log(focal / 500)) ** 2)
     tried = focal_sweep.sweep(SEARCH, 500.0, DIAGONAL, given=True)
     verdict = focal_sweep.judged(tried, focal_sweep.least_of(tried))
-    assert verdict == (False, "its edge lengths change by 5.0% or more, whatever the focal length")
+    words = "its edge lengths change by 5.0% or more, whatever the focal length"
+    assert verdict == focal_sweep.Judgement(0.0, False, words)
+
+
+@pytest.mark.parametrize(
+    ("curve", "clear", "evidence"),
+    [
+        (lambda far: 0.002 + 0.03 * far**2, True, True),
+        (lambda far: 0.01 + 0.006 * far**2, False, True),  # a ratio of 1.1
+        (lambda far: 0.0001 + 0.001 * far**2, False, True),  # a large ratio, but a small increase
+        (lambda far: 0.01 + 0.001 * far**2, False, False),
+        (lambda far: 0.003 + 0.002 * far, False, False),  # falls to one side
+        (lambda far: 0.002 + 0.03 * min(far**2, (far - 2) ** 2 + 0.01), False, False),  # two minima
+    ],
+)  # fmt: skip
+def test_a_minimum_is_clear_or_weak_evidence_or_none(
+    monkeypatch: pytest.MonkeyPatch, curve: Callable[[float], float], clear: bool, evidence: bool
+) -> None:
+    with_inconsistencies(monkeypatch, lambda focal: max(1e-5, curve(float(np.log(focal / 700)))))
+    tried = [focal_sweep.tried_at(SEARCH, 700 * focal_sweep.FOCAL_STEP**step, None) for step in range(-3, 7)]
+    assert all(tried)
+    judgement = focal_sweep.judged(tried, focal_sweep.least_of(tried))  # type: ignore[arg-type]
+    assert (judgement.clear, judgement.ratio > 0) == (clear, evidence)
+    assert judgement.words.startswith("Taken" if evidence else "its edge lengths")
 
 
 def test_refinement_recovers_the_true_depths_of_a_rigid_plane() -> None:
