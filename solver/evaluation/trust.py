@@ -182,7 +182,12 @@ def assess(
     turning, deforming = per_frame(shapes, rotations) if ordered else (None, None)
     found = [
         *_observation_signs(residual, hidden),
-        _sign(-turn, -NARROW, -STILL, f"The camera turned by only {turn:.0f}°; depth needs {NARROW:.0f}° or more."),
+        _sign(
+            -turn,
+            -NARROW,
+            -STILL,
+            f"The estimated cameras turn by only {turn:.0f}°; depth needs {NARROW:.0f}° or more.",
+        ),
         *_frame_signs(shown, behind, ordered=ordered),
         *_error_signs(expected, held_out_error, bounded=bounded),
         *_motion_signs(turning, deforming),

@@ -18,7 +18,7 @@ from pliant.schemas.job import Interpretation, Job, Progress, Status
 from pliant.schemas.options import Options
 from pliant.worker.jobs.finished import Finished
 
-REASON = "The camera turned by only 9°; depth needs 20° or more."
+REASON = "The estimated cameras turn by only 9°; depth needs 20° or more."
 TRUST = "Expected error about 4 % of the object's size; depth rests on 9° of turn."
 LAST = ["Use with care  " + TRUST + " Converged.", "  " + REASON]
 

@@ -80,8 +80,8 @@ def test_a_result_without_reasons_against_it_is_good() -> None:
     [
         ({"residuals": np.full((FRAMES, POINTS), 0.2)}, Verdict.WITH_CARE, "miss the tracks"),
         ({"residuals": np.full((FRAMES, POINTS), 0.9)}, Verdict.DO_NOT_USE, "miss the tracks"),
-        ({"turn": 12.0}, Verdict.WITH_CARE, "turned by only 12°"),
-        ({"turn": 2.0}, Verdict.DO_NOT_USE, "turned by only 2°"),
+        ({"turn": 12.0}, Verdict.WITH_CARE, "turn by only 12°"),
+        ({"turn": 2.0}, Verdict.DO_NOT_USE, "turn by only 2°"),
         (
             {"shapes_std": np.full((FRAMES, POINTS), 0.2)},
             Verdict.WITH_CARE,
@@ -126,7 +126,7 @@ def test_each_reason_alone_lowers_the_verdict(changed: dict[str, Any], verdict: 
 def test_the_most_severe_reason_comes_first() -> None:
     trust = judged(planar=True, turn=2.0)
     assert trust.verdict is Verdict.DO_NOT_USE
-    assert "turned by" in trust.reasons[0]
+    assert "turn by" in trust.reasons[0]
     assert trust.interval is None
     assert "at least" in trust.sentence
 
