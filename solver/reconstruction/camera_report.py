@@ -91,4 +91,4 @@ def unknown_centre_warning(view: Perspective, settings: Settings, known: KnownCa
     given = settings.centre is not None or (known is not None and known.principal_point is not None)
     if given or not view.bends:
         return None
-    return "Perspective was found, but the picture's centre is unknown and taken to be the middle of the tracks. Give image_size."
+    return "Perspective was found, but the picture's size is unknown, so the middle of the tracks is taken as its centre. Give image_size."

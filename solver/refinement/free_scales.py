@@ -90,12 +90,12 @@ def try_free_scales(
     share = _scale_gain_share(logs) if model_order.ordered else 1.0
     if not (gain > MIN_SCALE_GAIN * share and logs.std() > MIN_SCALE_STD):
         reason = (
-            f"Every scale is 1: free ones, {extent}, would gain {gain:.3f} in the logarithm of the "
-            "likelihood, no more than deformation alone does."
+            f"Every scale is 1: a scale per frame, {extent}, would gain {gain:.3f} in the log likelihood, no more than deformation "
+            "alone does."
         )
         return ScaleTrial(None, reason, fixed)
     logs = between(used, logs[:, None], len(rotations))[:, 0]
-    reason = f"Scales {extent} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
+    reason = f"Scales {extent} gain {gain:.3f} in the log likelihood per point and frame."
     return ScaleTrial(np.exp(logs - logs.mean()), reason, fixed)
 
 

@@ -331,7 +331,7 @@ def _with_depth_choice(estimate: CameraEstimate, stretch: float) -> CameraEstima
         return estimate
     sentence = (
         f"The tracks hardly distinguish depth from rotation: {1 / stretch:.2g} times the depth with {stretch:.2g} times the rotation "
-        "explains them about as well. The depth is typical for the width, like that of half a sphere."
+        "explains them about as well. A depth typical for the width is assumed, like that of half a sphere."
     )
     if estimate.perspective is not None and estimate.perspective.bends:
         sentence += " The focal length shows the tracks' perspective at this depth."

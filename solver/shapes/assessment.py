@@ -175,9 +175,11 @@ def _unclear_camera(view: Perspective | None, unit: float) -> str | None:
         return None
     curvature, gain = found
     other = "scaled_orthographic" if view.bends else "perspective"
+    required = "hardly more than" if gain > MIN_PERSPECTIVE_GAIN else "less than"
     return (
         f"Whether the tracks show perspective is unclear: a focal length of {unit / abs(curvature):.4g} gains {gain:.3f} in the log "
-        f"likelihood per point and frame, and {MIN_PERSPECTIVE_GAIN} is required. Give the focal length, or compare with camera={other}."
+        f"likelihood per point and frame, {required} the {MIN_PERSPECTIVE_GAIN} required. Give the focal length, or compare with "
+        f"camera={other}."
     )
 
 

@@ -133,7 +133,9 @@ def _choices(verdict: IsometricVerdict, surface: IsometricSurface, unit: float, 
         warnings.append(f"{few}; they have the shapes and cameras of the nearest other frames.")
     if not surface.placed.all():
         share = 1 - float(surface.placed.mean())
-        warnings.append(f"{share:.1%} of the points were never seen on the surface; they are placed at its centre.")
+        warnings.append(
+            f"{share:.1%} of the points could not be located on the surface; they are placed at its centre."
+        )
     return Choices(
         basis_size=0, temporal_weight=0.0, spatial_weight=0.0, robust_scale=0.0, temporal_order=1, low_rank_weight=0.0,
         laplacian="none", unit=unit, noise=surface.noise_std, reasons=reasons, warnings=tuple(warnings),

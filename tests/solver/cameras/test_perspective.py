@@ -440,7 +440,7 @@ def test_an_unknown_picture_centre_is_a_warning_where_perspective_is_found() -> 
 
     unknown = ((Settings(), None), (Settings(), KnownCamera.from_arrays(*orbit, focal=FOCAL)))
     for settings, known in unknown:
-        assert ["the picture's centre is unknown" in each for each in warnings(settings, known)] == [True]
+        assert ["the picture's size is unknown" in each for each in warnings(settings, known)] == [True]
     lens = KnownCamera.from_arrays(*orbit, focal=FOCAL, principal_point=(639.5, 359.5))
     for settings, known in (
         (Settings(image_size=PICTURE), None),

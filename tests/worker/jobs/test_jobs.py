@@ -51,7 +51,7 @@ def finish(jobs: Jobs, id: str, file: Path) -> Stored:
             stored,
             Finished(
                 metrics={"reprojection_median": 0.5}, outcome="converged", sentence="Converged.", warnings=(), artifacts=(artifact,),
-                verdict="with_care", verdict_reasons=("The estimated cameras turn by only 9°.",), trust_sentence="Expected error about 4 %.",
+                verdict="with_care", verdict_reasons=("It turns by only 9°.",), trust_sentence="Expected error about 4 %.",
             ),
             attempt_id=attempt_id, prefix=prefix, now=NOW, retention=60,
         ),
@@ -289,7 +289,7 @@ def test_a_result_is_published_and_read_in_ranges(jobs: Jobs, submit, inputs_fil
     job = jobs.get(id)
     assert (job.status, job.outcome, job.metrics) == (Status.SUCCEEDED, "converged", {"reprojection_median": 0.5})
     assert (job.verdict, job.trust_sentence) == ("with_care", "Expected error about 4 %.")
-    assert job.verdict_reasons == ["The estimated cameras turn by only 9°."]
+    assert job.verdict_reasons == ["It turns by only 9°."]
     artifact, blob = jobs.artifact(id, "report.json")
     assert artifact.bytes == blob.size == 3_000_000
     assert sum(len(chunk) for chunk in blob.read(10, 2_500_000)) == 2_499_990
