@@ -46,7 +46,7 @@ def rigid_evidence(gram: Floats, settings: Settings) -> tuple[Floats, str]:
         )
     return (
         none,
-        f"Every scale is 1: a scale per frame would explain {max(share, 0):.0%} of the residual of orthography, no more than deformation does.",
+        f"Every scale is 1: a scale per frame would explain {max(share, 0):.0%} of the residual of orthography, no more than deformation.",
     )
 
 
