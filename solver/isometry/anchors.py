@@ -16,6 +16,7 @@ from pliant.solver.isometry.inextensible import Indices
 from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats
 from pliant.solver.tracks.frame_selection import evenly_spread
+from pliant.solver.tracks.noise import RAYLEIGH_MEDIAN
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
@@ -235,7 +236,7 @@ def _fit_patches(points: Floats, seen: NDArray[np.bool_], patches: Indices) -> t
             np.einsum("nfq,nfac,nfqc->nqa", weight, inner, image - shift[:, :, None], optimize=True)[..., None],
         )[..., 0]
         off = np.linalg.norm(np.einsum("nqa,nfac->nfqc", shape, inner) + shift[:, :, None] - image, axis=3)
-        noise = max(float(np.median(off[known])) / 1.1774, 1e-6 * float(size))  # median of a Rayleigh variable
+        noise = max(float(np.median(off[known])) / RAYLEIGH_MEDIAN, 1e-6 * float(size))
         scale = max(noise, ANNEALED ** (sweep + 1) * float(size))
         weight = known / (1 + (off / (3 * scale)) ** 2) ** 2
     place = np.einsum("na,nfac->nfc", shape[:, 0], inner) + shift + middle[:, :, 0]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.isometry.inextensible import Indices
 from pliant.solver.records import Floats
+from pliant.solver.tracks.noise import RAYLEIGH_MEDIAN
 from scipy import sparse
 from scipy.sparse.csgraph import shortest_path
 
@@ -122,7 +123,9 @@ def extend(
     space[..., 2] = np.maximum(space[..., 2], nearest)
     off = np.linalg.norm(focal * space[..., :2] / space[..., 2:] + centre - tracks, axis=2)
     compared = seen & placed
-    limit = OUTLIER_DEVIATIONS * max(float(np.median(off[compared])) / 1.1774, SPLINE_ERROR * _deviation(images, known))
+    limit = OUTLIER_DEVIATIONS * max(
+        float(np.median(off[compared])) / RAYLEIGH_MEDIAN, SPLINE_ERROR * _deviation(images, known)
+    )
     outliers: NDArray[np.bool_] = np.asarray(compared & (off > limit))
     own = compared & ~outliers
     rays = np.concatenate([(tracks - centre) / focal, np.ones((*seen.shape, 1))], axis=2)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pliant.solver.agreement import check_seen
 from pliant.solver.records import Floats
 from pliant.solver.threads import SMALLEST, over_ranges
-from pliant.solver.tracks.noise import weighted_median
+from pliant.solver.tracks.noise import RAYLEIGH_MEDIAN, weighted_median
 from pliant.solver.tracks.normalization import Normalized
 
 MAX_SAMPLE_POINTS = 600
@@ -432,7 +432,7 @@ def _lengths(difference: Floats) -> Floats:
 def _typical(lengths: Floats, weight: Floats) -> float:
     """Return the standard deviation per coordinate of an isotropic Gaussian with this median length, weighted by confidence."""
     mask = weight > 0
-    return weighted_median(lengths[mask], weight[mask]) / 1.1774 if mask.any() else 0.0
+    return weighted_median(lengths[mask], weight[mask]) / RAYLEIGH_MEDIAN if mask.any() else 0.0
 
 
 def _leading(matrix: Floats, count: int) -> Floats:

@@ -15,6 +15,10 @@ OUTLIER_SHARE = 0.005
 """Share of gross outliers in the completion of the tracks above which outliers are rejected."""
 
 
+RAYLEIGH_MEDIAN = 1.1774
+"""Median length of a residual with two independent Gaussian coordinates, in their standard deviations: √(2 ln 2)."""
+
+
 def magnified(order: int) -> float:
     """Return the factor by which differences of an order over frames amplify the standard deviation of white noise."""
     return float(np.sqrt(comb(2 * order, order)))

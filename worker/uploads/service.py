@@ -15,11 +15,11 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from pliant.schemas.job import Upload
-from pliant.worker.errors import Conflict, OffsetMismatch, TooManyUploads, UnknownUpload
+from pliant.worker.errors import Conflict, TooManyUploads, UnknownUpload
 from pliant.worker.ids import check_id, is_id
 from pliant.worker.settings import Settings
 from pliant.worker.uploads.folder import LENGTH, PART, RESERVED, WHOLE, content, declared_length, locked, taken
-from pliant.worker.uploads.writer import Capacity, Writer, agreed_length
+from pliant.worker.uploads.writer import Capacity, Held, Writer, continued, incomplete
 
 MAX_UPLOADS = 100
 """Maximum number of uploads per owner."""
@@ -97,17 +97,14 @@ class Uploads:
             self._check_number()
         with locked(folder, make=offset == 0, id=id):
             file = content(folder)
-            if file is not None and file.name.startswith(WHOLE):
-                raise Conflict(
-                    "upload_complete", id=id, sentence=f"Upload {id!r} is complete. Use it, or delete it first."
+            held = (
+                None
+                if file is None
+                else Held(
+                    offset=file.stat().st_size, length=declared_length(folder), complete=file.name.startswith(WHOLE)
                 )
-            if offset > 0 and file is None:
-                raise UnknownUpload(id)
-            held = file.stat().st_size if file is not None and offset > 0 else 0
-            if offset != held:
-                raise OffsetMismatch(id, expected=held, got=offset)
-            known = declared_length(folder) if offset > 0 else None
-            agreed = agreed_length(length, known=known, offset=offset)
+            )
+            agreed = continued(id, held, offset=offset, length=length)
             writer = Writer(id=id, folder=folder, length=agreed, capacity=capacity)
             try:
                 writer.open(offset)
@@ -131,8 +128,7 @@ class Uploads:
         if file is None:
             raise UnknownUpload(id)
         if not file.name.startswith(WHOLE):
-            sentence = f"Upload {id!r} is not complete yet: send the rest, from the offset that HEAD reports."
-            raise Conflict("upload_incomplete", id=id, sentence=sentence)
+            raise incomplete(id)
         try:
             os.utime(file)  # use restarts the retention period
             try:

@@ -16,13 +16,13 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from pliant.schemas.job import Upload
-from pliant.worker.errors import Conflict, OffsetMismatch, QuotaExceeded, TooManyUploads, UnknownUpload
+from pliant.worker.errors import Conflict, QuotaExceeded, TooManyUploads, UnknownUpload
 from pliant.worker.ids import check_id, is_id
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.uploads.service import LATE, MAX_UPLOADS, Uploads
 from pliant.worker.uploads.states import RESERVED_FOR, State, UploadStates, open_states
-from pliant.worker.uploads.writer import Capacity, Writer, agreed_length
+from pliant.worker.uploads.writer import Capacity, Held, Writer, continued, incomplete
 
 FOLDER = "uploads/"
 """Prefix of the blob keys."""
@@ -65,15 +65,12 @@ class SharedUploads(Uploads):
         if offset == 0:
             check_id(id)
         before = self._state(id)
-        if before is not None and before.sha256 is not None:
-            raise Conflict("upload_complete", id=id, sentence=f"Upload {id!r} is complete. Use it, or delete it first.")
-        if before is None and offset > 0:
-            raise UnknownUpload(id)
-        held = before.offset if before is not None and offset > 0 else 0
-        if offset != held:
-            raise OffsetMismatch(id, expected=held, got=offset)
-        known = before.length if before is not None and offset > 0 else None
-        agreed = agreed_length(length, known=known, offset=offset)
+        held = (
+            None
+            if before is None
+            else Held(offset=before.offset, length=before.length, complete=before.sha256 is not None)
+        )
+        agreed = continued(id, held, offset=offset, length=length)
         if before is None and sum(name.startswith(f"{self._owner}/") for name in self.states.names()) >= MAX_UPLOADS:
             raise TooManyUploads(MAX_UPLOADS)
         writer = SharedWriter(
@@ -91,8 +88,7 @@ class SharedUploads(Uploads):
         if state is None:
             raise UnknownUpload(id)
         if state.sha256 is None:
-            sentence = f"Upload {id!r} is not complete yet: send the rest, from the offset that HEAD reports."
-            raise Conflict("upload_incomplete", id=id, sentence=sentence)
+            raise incomplete(id)
         try:
             with to.open("wb") as out:
                 for chunk in self.read(id, state):

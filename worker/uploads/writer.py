@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
-from pliant.worker.errors import InvalidRequest, QuotaExceeded, UploadTooLarge
+from pliant.worker.errors import Conflict, InvalidRequest, OffsetMismatch, QuotaExceeded, UnknownUpload, UploadTooLarge
 from pliant.worker.uploads.folder import LENGTH, PART, RESERVED, WHOLE, counting, reserve, taken
 
 RESERVED_AT_A_TIME = 16 << 20
@@ -181,6 +181,46 @@ class Writer:
         if size > free:
             raise QuotaExceeded(used=capacity.used + others + self.offset, quota=capacity.quota)
         return size if self.length is not None else min(size + RESERVED_AT_A_TIME, free)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Held:
+    """What is stored of an upload."""
+
+    offset: int
+    """Bytes."""
+    length: int | None
+    """Declared bytes of the complete upload."""
+    complete: bool
+
+
+def continued(id: str, held: Held | None, *, offset: int, length: int | None) -> int | None:
+    """Return the length of an upload that a request writes to, in bytes, if any request has declared it; offset 0 begins it anew.
+
+    Raises
+    ------
+    Conflict
+        It is complete; `OffsetMismatch` if its size differs from `offset`.
+    UnknownUpload
+        Nothing is stored to continue.
+    InvalidRequest
+        The lengths contradict each other.
+    """
+    if held is not None and held.complete:
+        raise Conflict("upload_complete", id=id, sentence=f"Upload {id!r} is complete. Use it, or delete it first.")
+    if held is None or offset == 0:
+        held = Held(offset=0, length=None, complete=False)
+        if offset > 0:
+            raise UnknownUpload(id)
+    if offset != held.offset:
+        raise OffsetMismatch(id, expected=held.offset, got=offset)
+    return agreed_length(length, known=held.length, offset=offset)
+
+
+def incomplete(id: str) -> Conflict:
+    """Return the error for the use of an upload that is not complete."""
+    sentence = f"Upload {id!r} is not complete yet: send the rest, from the offset that HEAD reports."
+    return Conflict("upload_incomplete", id=id, sentence=sentence)
 
 
 def agreed_length(given: int | None, *, known: int | None, offset: int) -> int | None:
