@@ -203,7 +203,7 @@ def _confirmed(search: FocalSearch, chosen: Tried, judgement: Judgement) -> tupl
     The weaker the evidence of the focal lengths, the better they must agree.
     """
     share = disagreement(search, chosen)
-    if share <= (DISAGREEMENT if judgement.clear else (judgement.ratio - 1) / DECISIVE):
+    if share <= (DISAGREEMENT if judgement.clear else min(DISAGREEMENT, (judgement.ratio - 1) / DECISIVE)):
         return True, f"{judgement.words} Halves of the frames agree on the lengths to within {share:.1%}."
     if not judgement.clear and share <= DISAGREEMENT:
         return False, "its edge lengths hardly single out a focal length"

@@ -69,6 +69,8 @@ def test_a_surface_that_the_halves_do_not_confirm_is_rejected(monkeypatch: pytes
         (False, 1.08, 0.009, True, "to within 0.9%."),
         (False, 1.08, 0.011, False, "its edge lengths hardly single out a focal length"),
         (False, 1.08, 0.4, False, "its edge lengths differ by 40% between halves of the frames"),
+        (False, 9.0, 0.03, False, "its edge lengths differ by 3% between halves of the frames"),
+        (False, np.inf, 0.03, False, "its edge lengths differ by 3% between halves of the frames"),
         (False, 9.0, np.inf, False, "its edge lengths differ by more than their length between halves"),
     ],
 )
