@@ -155,10 +155,8 @@ def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: 
     ranked = sorted(allowed, key=lambda one: costs[one.layout])
     documented = [one for one in ranked if order in (None, one.order) or options.layout != "auto"] or ranked
     best, others = documented[0], documented[1:]
-    clear = not others or (
-        np.isfinite(costs[best.layout])
-        and all(costs[other.layout] >= MIN_SMOOTHNESS_RATIO * costs[best.layout] for other in others)
-    )
+    known = np.isfinite(costs[best.layout]) or not others or not np.isfinite(array).any()  # `Tracks` refuses the last
+    clear = known and all(costs[other.layout] >= MIN_SMOOTHNESS_RATIO * costs[best.layout] for other in others)
     if clear and costs[best.layout] <= CONTRADICTED * costs[ranked[0].layout]:
         return best, [_comparison(best, others[0], costs)] if others else []
     choices: list[dict[str, Any]] = [
