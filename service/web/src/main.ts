@@ -21,7 +21,7 @@ const [said, gate] = [h("div", {}), h("div", {})];
 trouble.append(said, gate);
 
 /** Opens the token form, since a token can be accepted and still lack the scope for what one wants to do. */
-const another = button("Use another token", () => void askForToken(), { class: "quiet" });
+const another = button("Token", () => void askForToken(), { class: "quiet", title: "Use another token" });
 another.hidden = !hasToken();
 document.querySelector("header nav")?.append(another);
 /** Whether the user opened the token form, which then stays although the service answers. */
