@@ -195,8 +195,10 @@ class Attempts:
 
 def _seconds(timeout: object) -> float:
     """Return a timeout, which may be a number of NumPy, as a float."""
-    number = isinstance(timeout, SupportsFloat) and not isinstance(timeout, bool)
-    seconds = float(timeout) if number else math.nan  # type: ignore[arg-type]
+    try:
+        seconds = float(timeout) if isinstance(timeout, SupportsFloat) and not isinstance(timeout, bool) else math.nan
+    except (TypeError, ValueError):  # an array
+        seconds = math.nan
     if math.isnan(seconds):
         raise BadArgument(f"timeout: expected seconds as a number, or None, got {timeout!r}.")
     return seconds

@@ -74,11 +74,11 @@ class Followers:
         watcher.listeners += 1
         try:
             self._start_reader(jobs.records)  # before the first read, so that no change falls between the two
+            ended = (
+                await run_in_threadpool(jobs.get, id)
+            ).status.final  # before its events, which then include the last
             known = await run_in_threadpool(jobs.events, id, after=after)
             last = after or "0-0"
-            ended = (await run_in_threadpool(jobs.get, id)).status.final
-            if ended:
-                known = await run_in_threadpool(jobs.events, id, after=after)  # it may have ended between the two reads
             while True:
                 for event in known:
                     last = event.id

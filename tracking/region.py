@@ -43,8 +43,8 @@ LONG_STEP = 2
 def read_region(region: Region, size: tuple[int, int]) -> Bools:
     """Convert a region to a mask, shape `(H, W)`.
 
-    The region is the path of a mask picture of the film's size, an array `(H, W)` (bool, or uint8 with 128 and above inside), or a polygon
-    of pixels `(N, 2)` with N ≥ 3. In pictures with transparency, opaque pixels are inside. Pictures must be black and white, except for a
+    The region is the path of a mask picture of the film's size, an array `(H, W)` (bool, or uint8 with 128 and above inside, or of
+    0 and 1), or a polygon of pixels `(N, 2)` with N ≥ 3. In pictures with transparency, opaque pixels are inside. Pictures must be black and white, except for a
     soft outline; as the film's own, they are turned by their EXIF orientation.
 
     Raises
@@ -156,7 +156,10 @@ def _from_array(given: NDArray[np.generic]) -> Grey:
             "wrong_region", "a mask (H, W) of bool or uint8, or a polygon (N, 2) with N ≥ 3",
             f"shape {given.shape}, dtype {given.dtype}", "Convert the array.",
         )  # fmt: skip
-    return np.where(given, np.uint8(255), np.uint8(0)) if given.dtype == bool else np.asarray(given, dtype=np.uint8)
+    levels = np.asarray(given, dtype=np.uint8)
+    return (
+        levels * np.uint8(255) if levels.max(initial=0) == 1 else levels
+    )  # 0 and 1, as segmentation models return them
 
 
 def _black_and_white(levels: Grey) -> Grey:

@@ -95,8 +95,8 @@ class Client(Connection):
             pictures. The job tracks its points.
         region : path or array, optional
             Region to track in the film: a mask of the film's size, either a picture that is white inside, or an array (H, W) of
-            bool, or of uint8 with 128 and above inside. Without it and without the option `region_polygon`, the entire picture
-            is tracked.
+            bool, or of uint8 with 128 and above inside, or of 0 and 1. Without it and without the option `region_polygon`, the entire
+            picture is tracked.
         visible : array_like, optional
             Shape (F, P), bool or confidence in [0, 1]; only with an array of tracks.
         mesh : array_like, (rows, columns), path, optional

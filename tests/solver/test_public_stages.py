@@ -234,7 +234,8 @@ def test_mismatched_inputs_are_rejected(cameras: Cameras, prior: Prior, solution
 
 @pytest.mark.parametrize("prior", ["gaussian", "smooth"])
 def test_the_unit_of_given_scales_is_that_of_the_shapes_only(prior: str) -> None:
-    settings = Settings(prior=prior)  # type: ignore[arg-type]
+    # Rounding differs between the units, so at the usual tolerance the two solves may end one reweighting apart.
+    settings = Settings(prior=prior, tolerance=1e-7, max_reweightings=300)  # type: ignore[arg-type]
     changing = np.linspace(0.9, 1.1, len(MADE.rotations))
 
     def solved(unit: float) -> tuple[Solution, Cameras]:
@@ -244,9 +245,8 @@ def test_the_unit_of_given_scales_is_that_of_the_shapes_only(prior: str) -> None
         )
 
     (one, cameras), (other, again) = solved(1.0), solved(1000.0)
-    # Rounding differs between the units, so the reweightings end at shapes that differ by about their tolerance.
-    np.testing.assert_allclose(other.shapes, 1000 * one.shapes, atol=1e-3 * 1000 * np.abs(one.shapes).max())
-    np.testing.assert_allclose(other.camera.project(other.shapes), one.camera.project(one.shapes), atol=5e-2)
+    np.testing.assert_allclose(other.shapes, 1000 * one.shapes, atol=1e-4 * 1000 * np.abs(one.shapes).max())
+    np.testing.assert_allclose(other.camera.project(other.shapes), one.camera.project(one.shapes), atol=1e-2)
     np.testing.assert_allclose(other.camera.scales, changing / 1000)
     np.testing.assert_allclose(again.camera.scales, changing / 1000)
     if prior == "gaussian":

@@ -55,15 +55,20 @@ def test_the_levels_of_a_mask_of_16_bits_are_scaled(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_region(tmp_path / "mask.png", SIZE), INSIDE)
 
 
-@pytest.mark.parametrize("kind", ["array", "picture"])
-def test_an_empty_mask_of_low_levels_tells_its_brightest(tmp_path: Path, kind: str) -> None:
-    Image.fromarray(INSIDE.astype(np.uint8)).save(tmp_path / "mask.png")
+@pytest.mark.parametrize(("kind", "level"), [("array", 2), ("picture", 1)])
+def test_an_empty_mask_of_low_levels_tells_its_brightest(tmp_path: Path, kind: str, level: int) -> None:
+    levels = INSIDE.astype(np.uint8) * level
+    Image.fromarray(levels).save(tmp_path / "mask.png")
     with pytest.raises(FilmError) as caught:
-        read_region(INSIDE.astype(np.uint8) if kind == "array" else tmp_path / "mask.png", SIZE)
+        read_region(levels if kind == "array" else tmp_path / "mask.png", SIZE)
     assert str(caught.value) == (
-        "region: expected some pixels inside, got none: the brightest level is 1, of 255. "
+        f"region: expected some pixels inside, got none: the brightest level is {level}, of 255. "
         "Levels of 128 and above are inside: make the object white."
     )
+
+
+def test_an_array_of_zeros_and_ones_is_a_mask() -> None:
+    np.testing.assert_array_equal(read_region(INSIDE.astype(np.uint8), SIZE), INSIDE)
 
 
 @pytest.mark.parametrize(

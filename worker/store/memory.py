@@ -177,13 +177,11 @@ class MemoryRecords(Records):
 
     def _note(self, before: Stored | None, after: Stored) -> None:
         event = event_of(before, after)
-        if event is None:
-            return
-        self._clock += 1
-        name, data = event
-        events = self._events.setdefault(after.job.id, [])
-        events.append(Event(f"{self._clock}-0", name, data))
-        del events[: -events_kept(after)]
+        if event is not None:
+            self._clock += 1
+            events = self._events.setdefault(after.job.id, [])
+            events.append(Event(f"{self._clock}-0", *event))
+            del events[: -events_kept(after)]
         self._publish(after.job.id)
 
     def _publish(self, id: str) -> None:

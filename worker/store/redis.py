@@ -88,8 +88,8 @@ end
 if held[5] ~= ARGV[7] then redis.call('INCRBY', at .. 'used', tonumber(ARGV[7]) - tonumber(held[5])) end
 if ARGV[9] ~= '' then
   redis.call('XADD', at .. 'events:' .. ARGV[2], 'MAXLEN', ARGV[11], '*', 'name', ARGV[9], 'data', ARGV[10])
-  redis.call('PUBLISH', at .. 'changes', ARGV[2])
 end
+redis.call('PUBLISH', at .. 'changes', ARGV[2])
 if ARGV[12] ~= '' then redis.call('ZADD', at .. 'outbox', ARGV[12], ARGV[2]) end
 for i = 13, #ARGV, 2 do redis.call('HINCRBYFLOAT', at .. 'tally', ARGV[i], ARGV[i + 1]) end
 return 1
@@ -143,13 +143,13 @@ class RedisRecords(Records):
         self._log = client.register_script(_LOG)
 
     def create(self, stored: Stored, *, max_queued: int = 0, max_bytes: int = 0) -> Stored:
-        name, data = event_of(None, stored) or ("", "")
-        job = stored.job
+        event, job = event_of(None, stored), stored.job
+        assert event is not None
         with reachable():
             taken = self._create(
                 args=[
                     self._at, job.id, stored.version, job.status.value, stored.attempt_id, stored.owner, stored.sort_key,
-                    stored.bytes, stored.key or "", stored.model_dump_json(), name, data, events_kept(stored),
+                    stored.bytes, stored.key or "", stored.model_dump_json(), *event, events_kept(stored),
                     max_queued, "" if stored.max_running is None else stored.max_running, max_bytes, job.priority,
                 ]
             )  # fmt: skip

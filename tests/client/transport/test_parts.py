@@ -164,7 +164,7 @@ def test_a_region_of_zeros_and_ones_is_a_mask(tmp_path: Path) -> None:
     assert read_region(region_part(255 * mask, tmp_path), (8, 6)).sum() == 6
 
 
-@pytest.mark.parametrize("timeout", ["3", True, float("nan"), object()])
+@pytest.mark.parametrize("timeout", ["3", True, float("nan"), object(), np.ones(2)])
 def test_a_timeout_that_is_no_number_is_refused(timeout: Any) -> None:
     with pytest.raises(BadArgument, match="timeout: expected seconds as a number"):
         Client("http://pliant.test", transport=InMemoryService()).limits(timeout=timeout)
