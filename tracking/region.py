@@ -44,8 +44,8 @@ def read_region(region: Region, size: tuple[int, int]) -> Bools:
     """Convert a region to a mask, shape `(H, W)`.
 
     The region is the path of a mask picture of the film's size, an array `(H, W)` (bool, or uint8 with 128 and above inside, or of
-    0 and 1), or a polygon of pixels `(N, 2)` with N ≥ 3. In pictures with transparency, opaque pixels are inside. Pictures must be black and white, except for a
-    soft outline; as the film's own, they are turned by their EXIF orientation.
+    0 and 1), or a polygon of pixels `(N, 2)` with N ≥ 3. In pictures with transparency, opaque pixels are inside. Pictures must be black
+    and white, except for a soft outline; as the film's own, they are turned by their EXIF orientation.
 
     Raises
     ------

@@ -33,8 +33,7 @@ With `image_size`, the solver alone, processor s, noise of .5 px (`python -m ben
     60 × 500          20.2                29.1               19.2       19.7
     120 × 1,000       37.9                47.0               33.1       32.5
 
-Tracks that resemble those of a sheet take up to 25 s more, for the test for an isometric surface: three rendered films of a torso, a head
-and a shirt, of 80 frames and 2,500 to 4,000 points, took 57, 67 and 58 s, estimated at 26 s.
+Tracks that resemble those of a sheet take up to 25 s more, for the test for an isometric surface.
 
 With blocks of larger overlap, the solver alone took 11.6 GB and 520 processor seconds for 100 × 1,000,000, estimated at 17 GB and 821 s.
 Not covered: sparsely observed points, which take 80 bytes times the square of their number; and time with other options.
