@@ -6,9 +6,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from pliant.solver.descent import Descent
 from pliant.solver.records import Step
-from pliant.solver.stages import Load, Pace, Stage
+from pliant.solver.stages import Stage
 
 MIN_FRACTION_STEP = 0.002
 """Minimum increase of the fraction between reports: at most 500 calls of `on_step` besides those due to stages and `MAX_SILENCE`."""
@@ -22,13 +21,22 @@ EXPECTED_SHARE = 0.9
 MAX_FRACTION = 0.99
 """Largest fraction reported before the end."""
 
+PACE_PRIOR = 0.5
+"""Planned seconds that count as measured at the planned pace, so that the first units alone do not determine the pace."""
+
+OWN_PACE = 4.0
+"""Weight of a stage's own pace, per completed share of it, at most 1, relative to the pace of all stages: its units take similar times."""
+
 
 class Monitor:
-    """Report steps with a fraction that never decreases, and remember a request to stop.
+    """Report steps with a fraction that never decreases and the remaining time, and remember a request to stop.
 
     A call counts one unit of work and returns whether to stop; pass the monitor on as `should_stop`. Once a call has returned True, all
-    later ones do. The fraction is the expected duration of the finished stages divided by that of all stages, so elapsed time divided by it
-    estimates the total. Stages that do not run are dropped from the plan.
+    later ones do. Stages that do not run are dropped from the plan.
+
+    The fraction is the planned duration of the finished work divided by that of all stages. The pace, the measured duration of the finished
+    work divided by its planned one, adapts the remaining time to speed and load of the machine. As the current stage advances, its own pace
+    replaces that of all stages, because its units take similar times.
 
     Parameters
     ----------
@@ -38,15 +46,8 @@ class Monitor:
         The user's; returns True to stop the solve.
     plan : sequence of Stage
         Expected stages of the solve, in order.
-    descent : Descent, optional
-        Prediction of the reweightings.
-    seconds_per_iteration : float
-        Planned time of a conjugate-gradient iteration.
     clock : callable
         Monotonic seconds.
-    work : callable
-        Processor seconds of this process. They measure the pace, so that other load on the machine does not count as slow work; the
-        remaining time is converted to wall time by the latest seconds per processor second.
     """
 
     def __init__(
@@ -55,40 +56,36 @@ class Monitor:
         should_stop: Callable[[], bool] | None = None,
         *,
         plan: Sequence[Stage] = (Stage("shapes", 1.0, 1000),),
-        descent: Descent | None = None,
-        seconds_per_iteration: float = 0.0,
         clock: Callable[[], float] = time.monotonic,
-        work: Callable[[], float] = time.process_time,
     ) -> None:
         self.stopped = False
         """Whether a unit of work found a request to stop."""
-        self._on_step, self._should_stop, self._clock, self._work = on_step, should_stop, clock, work
+        self.current = plan[0]
+        """The current stage."""
+        self._on_step, self._should_stop, self._clock = on_step, should_stop, clock
         self._last = Step("cameras", 0.0)
-        self._reported = clock()
-        self._done, self._current, self._ahead = 0.0, plan[0], list(plan[1:])
-        self._units, self._share, self._blocks = 0, 0.0, False
-        self._pace, self._load = Pace(work()), Load(clock(), work())
-        self._descent = Descent() if descent is None else descent
-        self._seconds_per_iteration = seconds_per_iteration
+        self._ahead = list(plan[1:])
+        self._began = self._reported = clock()
+        self._units, self._share = 0, 0.0  # of the current stage
+        self._done = 0.0  # planned seconds of all work before it
+        self._measured = self._planned = PACE_PRIOR  # seconds of the finished stages
 
     def __call__(self) -> bool:
         """Count a unit of work; return whether to stop."""
         if not self.stopped and self._should_stop is not None:
             self.stopped = bool(self._should_stop())
         self._units += 1
-        if self._current.name == "shapes":
-            self._descent.current += 1
+        self._share = max(self._share, _filled(self._units, self.current))
+        if self._fraction() >= self._last.fraction + MIN_FRACTION_STEP:
+            self.report(self._last)
         else:
-            self._share = max(self._share, _filled(self._units, self._current))
-        fraction = self._fraction()
-        if fraction >= self._last.fraction + MIN_FRACTION_STEP or self._clock() - self._reported >= MAX_SILENCE:
-            self._emit(replace(self._last, fraction=fraction))
+            self.pulse()
         return self.stopped
 
     def pulse(self) -> None:
         """Report the progress again after `MAX_SILENCE`; counts no unit of work."""
         if self._clock() - self._reported >= MAX_SILENCE:
-            self._emit(replace(self._last, fraction=self._fraction()))
+            self.report(self._last)
 
     def enter(self, name: str, *, units: int | None = None) -> None:
         """Begin a stage and drop the planned stages before it; do nothing if the stage is not ahead.
@@ -100,66 +97,56 @@ class Monitor:
         units : int, optional
             Expected units of work, replacing the planned number.
         """
-        place = next((number for number, stage in enumerate(self._ahead) if stage.name == name), None)
+        place = self._place(name)
         if place is None:
             return
-        self._done += self._share * self._current.seconds  # less than planned if it ended early
-        self._pace.next(self._current, self._share, self._work())
-        self._current, self._ahead = self._ahead[place], self._ahead[place + 1 :]
+        done, now = self._share * self.current.seconds, self._clock()  # less than planned if it ended early
+        if done > 0:
+            self._measured, self._planned = self._measured + now - self._began, self._planned + done
+        self._done, self._began = self._done + done, now
+        self.current, self._ahead = self._ahead[place], self._ahead[place + 1 :]
         if units is not None:
-            seconds = self._current.seconds * units / max(self._current.units, 1)
-            self._current = replace(self._current, seconds=seconds, units=units)
+            seconds = self.current.seconds * units / max(self.current.units, 1)
+            self.current = replace(self.current, seconds=seconds, units=units)
         self._units, self._share = 0, 0.0
-        if name == "shapes":
-            self._descent.begin(None, self._work())
 
     def expect(self, stages: Sequence[Stage], *, before: str) -> None:
         """Insert stages that the data require into the plan, before the stage named `before`, or at the end without it."""
-        place = next((number for number, stage in enumerate(self._ahead) if stage.name == before), len(self._ahead))
+        place = self._place(before)
+        place = len(self._ahead) if place is None else place
         self._ahead[place:place] = stages
 
-    def expect_corrections(self, ahead: int) -> None:
-        """Expect at most `ahead` corrections of the tracks for perspective; call before the first and after each."""
-        self._descent.expect_corrections(ahead)
-
     def report(self, step: Step) -> None:
-        """Report a step; the objectives of initialisation and reweightings determine the completed share of the stage `shapes`."""
-        if step.stage == "finish":
-            self._emit(replace(step, fraction=step.fraction if step.fraction == 1 else self._fraction()))
-            return
-        if step.stage == "initialise":
-            self.enter("shapes")
-            self._descent.begin(step.objective, self._work())
-        elif step.stage == "reweight" and step.objective is not None:
-            self._descent.reweighted(step.objective)
-            self._share = max(self._share, self._descent.share())
-        self._emit(replace(step, fraction=self._fraction()))
+        """Report a step with the present fraction and remaining time; a fraction of 1 is kept."""
+        ended = step.fraction == 1
+        fraction, left = (1.0, 0.0) if ended else (self._fraction(), self._seconds_left())
+        self._last, self._reported = replace(step, fraction=fraction, seconds_left=left), self._clock()
+        if self._on_step is not None:
+            self._on_step(self._last)
 
     def report_block(self, step: Step, share: float) -> None:
         """Report a step of one of several blocks of points; `share` is the completed share of the stage `shapes`."""
         self.enter("shapes")
-        self._blocks, self._share = True, max(self._share, share)
-        self._emit(replace(step, fraction=self._fraction()))
+        self._share = max(self._share, share)
+        self.report(step)
+
+    def _place(self, name: str) -> int | None:
+        return next((place for place, stage in enumerate(self._ahead) if stage.name == name), None)
 
     def _fraction(self) -> float:
-        done = self._done + self._share * self._current.seconds
-        left = (1 - self._share) * self._current.seconds + sum(stage.seconds for stage in self._ahead)
+        done = self._done + self._share * self.current.seconds
+        left = (1 - self._share) * self.current.seconds + sum(stage.seconds for stage in self._ahead)
         return max(self._last.fraction, min(done / max(done + left, 1e-9), MAX_FRACTION))
 
-    def _left(self) -> float:
-        ahead, now = sum(stage.seconds for stage in self._ahead), self._work()
-        if self._current.name != "shapes" or self._blocks:
-            left = self._pace.left(self._current, self._share, ahead, now)
-        else:
-            per_iteration = self._pace.known * self._seconds_per_iteration
-            left = self._descent.seconds_left(now, seconds_per_iteration=per_iteration) + self._pace.known * ahead
-        return left * self._load.seconds_per_work(self._clock(), now)
-
-    def _emit(self, step: Step) -> None:
-        left = 0.0 if step.fraction == 1 else self._left()
-        self._last, self._reported = replace(step, seconds_left=left), self._clock()
-        if self._on_step is not None:
-            self._on_step(self._last)
+    def _seconds_left(self) -> float:
+        share, planned, spent = self._share, self.current.seconds, self._clock() - self._began
+        ahead = sum(stage.seconds for stage in self._ahead)
+        if share <= 0:
+            pace = self._measured / self._planned
+            return max(pace * planned - spent, 0.0) + pace * ahead
+        pace = (self._measured + spent) / (self._planned + share * planned)
+        own = min(OWN_PACE * share, 1.0)
+        return (1 - share) * ((1 - own) * pace * planned + own * spent / share) + pace * ahead
 
 
 def enter(should_stop: Callable[[], bool] | None, name: str, *, units: int | None = None) -> None:

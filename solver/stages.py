@@ -1,8 +1,8 @@
 """Stages of a solve and their expected durations, from which its progress is estimated.
 
-Stages of the cameras consist of units of work: iterations of L-BFGS and of expectation maximisation, whose cost grows with the number of
-frames that the stage uses. Only ratios of the durations matter, because the remaining time is extrapolated from the elapsed time. Which
-stages run depends on the data; a skipped stage is dropped from the plan when a later one begins.
+A stage consists of units of work: iterations of L-BFGS and of expectation maximisation for the cameras, of conjugate gradients for the
+shapes. Only ratios of the durations matter, because the remaining time is extrapolated from the elapsed time. Which stages run depends on
+the data; a skipped stage is dropped from the plan when a later one begins.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pliant.solver.descent import OVERHEAD, expected_iterations, expected_reweightings
 from pliant.solver.limits import learned_frames
 from pliant.solver.records import Floats
 
@@ -18,9 +17,14 @@ UNIT_SECONDS, FRAME_SECONDS = 7e-5, 1.3e-5
 """Seconds per unit of work, and in addition per unit and frame, on one core: .2 ms at 10 frames, .46 at 30, .7 at 48, 1 at 74. The times
 below were measured on the same core."""
 
-ITERATION_FRAME_SECONDS, ITERATION_SECONDS = 3e-5, {True: 5.3e-8, False: 4e-8}
-"""Seconds per unit of a reweighting: per frame, and in addition per frame and point; the key is whether a prior is learned. Within 40 % of
-the times measured for 40 × 800, 60 × 4,000, 99 × 600, 99 × 6,000, 300 × 300, 1,000 × 300 and 3,000 × 300."""
+SHAPES_UNITS, UNITS_PER_UNSEEN_FRAME, MOST_SHAPES_UNITS = 55.0, 9.0, 300.0
+"""Units of the stage `shapes`: where nothing is hidden, in addition per frame of `unseen_frames`, and at most. Where a point is hidden for
+ℓ frames, the equations link these frames in a chain, so conjugate gradients need more iterations and leave more to the next reweighting.
+Measured: 35 to 91, and 223 for points hidden for 18 frames in a row."""
+
+ITERATION_FRAME_SECONDS, ITERATION_SECONDS = 2e-5, {True: 7e-8, False: 5e-8}
+"""Seconds per unit of a reweighting: per frame, and in addition per frame and point; the key is whether a prior is learned. Within a factor
+of 1.7 of the times measured for 10 × 20,000, 40 × 800, 50 × 100,000, 60 × 4,000, 60 × 10,000, 99 × 6,000 and 3,000 × 300."""
 
 START_FRAME_SECONDS, START_SECONDS, START_UNITS = 5e-4, 8e-7, 9
 """Start of the shapes: seconds per frame, in addition per frame and point, and units of work. Measured for the same sizes and
@@ -79,18 +83,9 @@ CUBIC_FRAMES = {"covariance": 200}
 """Number of frames at which a unit takes twice as long as `UNITS` predicts, because it also computes eigenvalues, whose time is cubic in
 the number of frames. Measured with 360 frames: 2.6 to 2.7 times the time of a unit of `multistart`."""
 
-PACE_PRIOR = 0.5
-"""Planned seconds that count as measured at the planned pace, so that the first units alone do not determine the pace."""
-
 REFINEMENT_UNITS = {True: 2930, False: 185}
 """Units of the stage `refinement`; the key is whether the covariance may couple the modes. Until the model order determines this, the plan
 has a number in between."""
-
-LOAD_SECONDS, LOAD_PRIOR = 20.0, 1.0
-"""Seconds over which the load of the machine is measured, and processor seconds that count as measured without load."""
-
-OWN_PACE = 4.0
-"""Weight of a stage's own pace, per completed share of it, relative to the pace of all stages: its units take similar times."""
 
 GIVEN_ROTATIONS = (1.56, 1.6)
 """Stage `scales` with given rotations, which has a third start, relative to estimated ones: number of units (1,283), and time of a unit.
@@ -132,10 +127,10 @@ def planned(
     unseen : float
         `unseen_frames` of the tracks.
     """
-    iterations = expected_iterations(unseen)
-    work = expected_reweightings(unseen) * (1 + iterations + OVERHEAD)
     start = Stage("start", frames * (START_FRAME_SECONDS + START_SECONDS * points), START_UNITS)
-    shapes = Stage("shapes", work * iteration_seconds(frames, points, gaussian=gaussian), 100)
+    units = min(SHAPES_UNITS + UNITS_PER_UNSEEN_FRAME * unseen, MOST_SHAPES_UNITS)
+    seconds = frames * (ITERATION_FRAME_SECONDS + ITERATION_SECONDS[gaussian] * points)
+    shapes = Stage("shapes", units * seconds, round(units))
     last = [Stage("finish", FINISH_SECONDS * frames * points, 3), *([stage_of("trust", frames)] if gaussian else [])]
     first = [Stage("surface", SURFACE_SECONDS * min(frames, 24), 280, setup=SURFACE_SETUP)] if sheet else []
     most_frames, most_points = MOST_COMPLETED
@@ -145,11 +140,6 @@ def planned(
     first.append(Stage("completion", 0.1 + filled, 6, growth=RANK_GROWTH))
     learned = learning(frames, used, gaussian=gaussian, known_cameras=known_cameras, known_scales=known_scales)
     return (*first, *learned, start, shapes, *last)
-
-
-def iteration_seconds(frames: int, points: int, *, gaussian: bool) -> float:
-    """Return the expected seconds of a unit of a reweighting: a conjugate-gradient iteration, or work of the same duration."""
-    return frames * (ITERATION_FRAME_SECONDS + ITERATION_SECONDS[gaussian] * points)
 
 
 def unseen_frames(visible: Floats) -> float:
@@ -188,69 +178,3 @@ def stage_of(name: str, frames: int) -> Stage:
     used = min(frames, most_frames)
     curved = 1 + used / CUBIC_FRAMES[name] if name in CUBIC_FRAMES else 1.0
     return Stage(name, units * cost * curved * (UNIT_SECONDS + FRAME_SECONDS * used), units)
-
-
-@dataclass(slots=True)
-class Pace:
-    """Remaining time of a plan, from the durations of the stages so far.
-
-    The pace is the measured time of the finished stages divided by the planned time of the work they did, which adapts the plan to speed
-    and load of the machine. A stage that ended early counts with its finished units only, or it would make the machine look faster. The
-    stage `shapes` is excluded, because `Descent` extrapolates it separately.
-    """
-
-    began: float
-    """Processor time at which the current stage began."""
-
-    measured: float = PACE_PRIOR
-    planned: float = PACE_PRIOR
-
-    def next(self, stage: Stage, share: float, now: float) -> None:
-        """Record a finished stage; `share` is the completed share of its units, 0 if it was skipped."""
-        if share > 0 and stage.name != "shapes":
-            self.measured += now - self.began
-            self.planned += share * stage.seconds
-        self.began = now
-
-    @property
-    def known(self) -> float:
-        """Ratio of measured to planned time of the finished stages."""
-        return self.measured / self.planned
-
-    def left(self, stage: Stage, share: float, ahead: float, now: float) -> float:
-        """Return the remaining seconds.
-
-        Parameters
-        ----------
-        stage : Stage
-            The current stage; not `shapes`, unless it is solved in blocks.
-        share : float
-            Completed share of it.
-        ahead : float
-            Planned seconds of the stages that follow.
-        now : float
-            Processor time, seconds.
-        """
-        spent = now - self.began
-        if share <= 0:
-            return max(self.known * stage.seconds - spent, 0.0) + self.known * ahead
-        pace = (self.measured + spent) / (self.planned + share * stage.seconds)
-        own = min(OWN_PACE * share, 1.0)
-        rest = (1 - share) * ((1 - own) * pace * stage.seconds + own * spent / share)
-        return rest + pace * ahead
-
-
-class Load:
-    """Wall time per processor second of this process, measured over the last `LOAD_SECONDS`.
-
-    Above 1 if other processes use the cores, below 1 if this process uses several cores.
-    """
-
-    def __init__(self, now: float, work: float) -> None:
-        self._old = self._middle = (now, work)
-
-    def seconds_per_work(self, now: float, work: float) -> float:
-        """Return the latest ratio, given wall time `now` and processor time `work`, both in seconds."""
-        if now - self._middle[0] > LOAD_SECONDS / 2:
-            self._old, self._middle = self._middle, (now, work)
-        return (now - self._old[0] + LOAD_PRIOR) / (work - self._old[1] + LOAD_PRIOR)

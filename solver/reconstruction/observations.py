@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.cameras.perspective import Perspective
-from pliant.solver.descent import Descent
 from pliant.solver.errors import InvalidInput
 from pliant.solver.limits import frame_chunks
 from pliant.solver.monitor import Monitor
 from pliant.solver.records import Floats, KnownCamera, Step, Tracks
 from pliant.solver.settings import Settings
-from pliant.solver.stages import iteration_seconds, planned, unseen_frames
+from pliant.solver.stages import planned, unseen_frames
 from pliant.solver.tracks.normalization import Normalized, normalize, relative
 
 OnStep = Callable[[Step], None]
@@ -149,8 +148,4 @@ def monitored(
         known_scales=known is not None and known.scales is not None,
         ordered=settings.order == "film", sheet=sheet, unseen=unseen,
     )  # fmt: skip
-    return Monitor(
-        on_step, should_stop, plan=[stage for stage in plan if not only or stage.name in only],
-        descent=Descent(unseen, settings.tolerance, settings.max_reweightings),
-        seconds_per_iteration=iteration_seconds(tracks.num_frames, tracks.num_points, gaussian=settings.gaussian),
-    )  # fmt: skip
+    return Monitor(on_step, should_stop, plan=[stage for stage in plan if not only or stage.name in only])

@@ -32,6 +32,7 @@ def shapes_from(
     start: Start, monitor: Monitor, *, seconds: dict[str, float], changes: Changes | None = None
 ) -> Solution:
     """Return the solution computed from a start; `seconds` is the time per stage so far, `changes` is as for `assessed`."""
+    monitor.enter("shapes")
     monitor.report(_step_of("initialise", start.state, start))
     began = time.perf_counter()
     history, start = [start.state], replace(start, state=start.state.summary())  # so that no step keeps its arrays
@@ -48,12 +49,13 @@ def _minimised(start: Start, history: list[State], monitor: Monitor) -> tuple[St
     """Return the start, its tracks corrected for perspective with the depths of the shapes, the history, and the outcome."""
     view = start.estimate.perspective
     corrections = DEPTH_ROUNDS if view is not None and view.bends else 0
-    monitor.expect_corrections(corrections)
+    if corrections > 0:
+        monitor.expect([replace(monitor.current, name="corrections")], before="finish")
     history, outcome = _loop(start, history, monitor)
-    for ahead in reversed(range(corrections)):
+    for _ in range(corrections):
         if outcome in (Outcome.STOPPED, Outcome.MAX_REWEIGHTINGS):
             break
-        monitor.expect_corrections(ahead)
+        monitor.enter("corrections")
         problem, flat, changed = corrected_again(
             start.problem, history[-1], start.observations.normalized, start.flat, start.estimate, start.kept
         )

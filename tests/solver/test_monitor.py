@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from pliant.solver import KnownCamera, Outcome, Settings, Step, Tracks, gallery, solve
 from pliant.solver.cameras.factorization import refine_factor
-from pliant.solver.descent import Descent, expected_iterations, steps_left
 from pliant.solver.model import expectation_maximisation
-from pliant.solver.monitor import Monitor
+from pliant.solver.monitor import PACE_PRIOR, Monitor
 from pliant.solver.pulse import pulse, pulses_to
-from pliant.solver.stages import Pace, Stage, planned, unseen_frames
+from pliant.solver.stages import MOST_SHAPES_UNITS, Stage, planned, unseen_frames
 from pliant.solver.threads import over_ranges, threads_limited
 from pliant.solver.tracks.completion import CHUNKS_PER_TICK, POINTS_PER_CHUNK, complete
 from pliant.solver.tracks.normalization import normalize
@@ -116,18 +115,17 @@ def test_skipped_stages_leave_the_plan_and_new_ones_join_it() -> None:
     assert steps[-1].fraction == pytest.approx(0.45 * 2 / 105)
     monitor.enter("nothing of that name")
     monitor.enter("shapes")  # scales are skipped
-    monitor.report(Step("initialise", 0.0, objective=1.0))
-    for objective in (0.5, 0.25, 0.125):  # half of the usual six
-        monitor.report(Step("reweight", 0.0, objective=objective))
-    assert steps[-1].fraction == pytest.approx((0.9 + 0.5 * 2) / 3.9)  # 0.9 of 2 s were done when it ended early
+    for _ in range(5):
+        monitor()
+    assert steps[-1].fraction == pytest.approx((0.9 + 0.45 * 2) / 3.9)  # 0.9 of 2 s were done when it ended early
     monitor.expect([Stage("scales", 5.0, 10)], before="trust")
     monitor.enter("scales", units=20)  # twice as long as planned
     monitor()
     monitor.report(Step("cameras", 0.0))
-    assert steps[-1].fraction == pytest.approx(1.9 / 3.9)  # progress does not decrease when the plan grows
+    assert steps[-1].fraction == pytest.approx(1.8 / 3.9)  # progress does not decrease when the plan grows
     monitor.enter("trust")
     assert monitor() is False
-    assert steps[-1].fraction == pytest.approx((1.9 + 0.45 + 0.09) / (1.9 + 0.45 + 1))
+    assert steps[-1].fraction == pytest.approx((1.8 + 0.45 + 0.09) / (1.8 + 0.45 + 1))
     monitor.report(Step("finish", 1.0))
     assert steps[-1].fraction == 1.0
 
@@ -145,7 +143,7 @@ def test_slow_units_are_reported_however_little_they_add() -> None:
 def test_pulses_are_reported_after_a_silence_and_count_no_work() -> None:
     steps: list[Step] = []
     now = [0.0]
-    monitor = Monitor(steps.append, plan=[Stage("shapes", 1.0, 10**6)], clock=lambda: now[0], work=lambda: now[0])
+    monitor = Monitor(steps.append, plan=[Stage("shapes", 1.0, 10**6)], clock=lambda: now[0])
     pulse()  # without a receiver
     with pulses_to(monitor.pulse):
         for _ in range(10):
@@ -203,95 +201,88 @@ def test_more_frequent_reports_do_not_change_the_shapes(blocks: bool, monkeypatc
     np.testing.assert_array_equal(before.shapes, after.shapes)
 
 
-def descended(objectives: list[float], *, unseen: float = 0.0, iterations: int = 3, most: int = 100) -> Descent:
-    descent = Descent(unseen, tolerance=1e-4, most=most)
-    descent.begin(objectives[0], 0.0)
-    for objective in objectives[1:]:
-        descent.current = iterations
-        descent.reweighted(objective)
-    return descent
-
-
-def test_remaining_reweightings_are_predicted_from_the_objective() -> None:
-    objectives = list(1 + 0.5 ** np.arange(25))
-    ends = next(n for n in range(1, 25) if (objectives[n - 1] - objectives[n]) / objectives[n - 1] <= 1e-4)
-    for count in range(8, ends):
-        left = descended(objectives[: count + 1]).reweightings_left()
-        assert (ends - count) / 2 <= left <= 2 * (ends - count)
-    assert descended(objectives[: ends + 1]).reweightings_left() == 0
-    assert descended(objectives[: ends + 1]).share() == 1
-    assert descended(objectives[:4], most=3).reweightings_left() == 0
-    assert steps_left(1e-5, 1e-3, 8, tolerance=1e-4) == 0
-    assert steps_left(1e-3, None, 1, tolerance=1e-4) > 1
-    power = [1 / step**2 for step in range(1, 200)]
-    assert 34 < steps_left(power[49], power[48], 50, tolerance=1e-4) < 51, "between geometric, 34, and a power, 50"
-
-
-def test_long_hidden_gaps_predict_more_and_longer_reweightings() -> None:
+def test_long_hidden_gaps_are_planned_with_more_units() -> None:
     visible = np.ones((20, 2))
     visible[3:6, 0] = visible[10:12, 0] = 0
     visible[:, 1] = [1, 0] * 10
     assert unseen_frames(visible) == 2.0  # three frames in a row, and one
-    assert expected_iterations(0) < expected_iterations(20) < expected_iterations(1000) == 60
-    seen, hidden = descended([1.0, 0.5]), descended([1.0, 0.5], unseen=20.0, iterations=15)
-    assert hidden.reweightings_left() > 1.5 * seen.reweightings_left()
-    assert hidden.units_ahead() > 2 * seen.units_ahead()
-    assert descended([1.0, 0.5], unseen=20.0, iterations=30).units_ahead() == 13, "fewer than in the first"
-    first = Descent()
-    assert first.units_ahead() == 8, "five iterations, and what a reweighting does besides"
-    first.current = 58
-    assert first.units_ahead() == 58, "the reweighting under way already has more"
-    size = {"gaussian": True, "known_cameras": False, "sheet": False}
-    seconds = [
-        {stage.name: stage.seconds for stage in planned(40, 10_000, unseen=each, **size)}["shapes"]
-        for each in (0.0, 20.0)
-    ]
-    assert seconds[1] > 4 * seconds[0]
+
+    def shapes(unseen: float) -> Stage:
+        plan = planned(40, 10_000, gaussian=True, known_cameras=False, sheet=False, unseen=unseen)
+        return next(stage for stage in plan if stage.name == "shapes")
+
+    assert shapes(0).units < shapes(2).units < shapes(20).units < shapes(1000).units == MOST_SHAPES_UNITS
+    assert shapes(20).seconds > 4 * shapes(0).seconds
 
 
-def test_complete_tracks_predict_few_and_short_reweightings() -> None:
-    """Objectives and units of a flag of 40 frames: iterations fall from 34 to 3 in the last reweighting."""
-    objectives, units = [382.36, 14.423, 2.2499, 1.9998, 1.99246, 1.99241], [12, 10, 12, 39, 8]
-    descent = Descent(0.0, tolerance=1e-4)
-    descent.begin(objectives[0], 0.0)
-    left = []
-    for objective, count in zip(objectives[1:], units, strict=True):
-        descent.current = count
-        descent.reweighted(objective)
-        left.append((round(descent.reweightings_left(), 1), round(descent.units_ahead(), 1)))
-    assert left[2] == (3.0, 12.0), "a decrease of 11 % says nothing about the end"
-    assert left[3] == (1.6, 17.4), "one of .4 % is followed by a smaller and shorter step"
-    assert left[4][0] == 0
-    hidden = descended(objectives[:5], unseen=2.0)
-    assert hidden.reweightings_left() > descended(objectives[:5]).reweightings_left() + 1, "hidden points settle slowly"
+class Clock:
+    """A monitor of a plan whose units take given times."""
+
+    def __init__(self, *plan: Stage) -> None:
+        self.now = 0.0
+        self.steps: list[Step] = []
+        self.monitor = Monitor(self.steps.append, plan=plan, clock=lambda: self.now)
+
+    def work(self, units: int, seconds: float) -> None:
+        for _ in range(units):
+            self.now += seconds
+            self.monitor()
+
+    @property
+    def left(self) -> float:
+        self.monitor.report(Step("cameras", 0.0))
+        left = self.steps[-1].seconds_left
+        assert left is not None
+        return left
+
+
+def test_the_pace_of_finished_stages_predicts_later_ones() -> None:
+    clock = Clock(Stage("starts", 8.0, 80), Stage("scales", 10.0, 10), Stage("shapes", 20.0, 100))
+    assert clock.left == pytest.approx(38)
+    clock.work(80, 0.2)  # twice as long as planned
+    clock.monitor.enter("scales")
+    assert clock.left == pytest.approx(30 * (16 + PACE_PRIOR) / (0.9 * 8 + PACE_PRIOR))
 
 
 def test_a_stage_that_ends_early_does_not_change_the_pace() -> None:
-    pace = Pace(0.0)
-    pace.next(Stage("refinement", 10.0, 1000), 0.1, 1.0)  # a tenth of the units in a tenth of the time
-    assert pace.known == 1.0
-    pace.next(Stage("scales", 2.0, 100), 1.0, 5.0)  # twice as long as planned
-    assert pace.known == pytest.approx(5.5 / 3.5)
-    pace.next(Stage("starts", 2.0, 100), 0.0, 6.0)  # skipped
-    assert pace.known == pytest.approx(5.5 / 3.5)
+    clock = Clock(Stage("refinement", 10.0, 1000), Stage("starts", 5.0, 100), Stage("scales", 2.0, 100))
+    clock.work(100, 0.009)  # .09 of the stage
+    clock.monitor.enter("scales")  # starts are skipped
+    assert clock.left == pytest.approx(2)
 
 
-def test_corrections_for_perspective_are_expected_and_counted_down() -> None:
-    descent = Descent()
-    descent.begin(1.0, 0.0)
-    before = descent.reweightings_left()
-    descent.expect_corrections(4)
-    assert descent.reweightings_left() > before + 4
-    descent.reweighted(0.5)
-    descent.reweighted(0.5)
-    left = [descent.reweightings_left()]
-    for ahead in (3, 2, 1, 0):
-        descent.expect_corrections(ahead)
-        descent.reweighted(0.5)
-        descent.reweighted(0.5)
-        left.append(descent.reweightings_left())
-    assert left == sorted(left, reverse=True)
-    assert left[-1] == 0
+@pytest.mark.parametrize("pace", [0.1, 1.0, 10.0])
+def test_the_pace_of_the_current_stage_replaces_that_of_the_plan(pace: float) -> None:
+    clock = Clock(Stage("shapes", 10.0, 100))
+    left = []
+    for _ in range(10):
+        clock.work(10, pace * 0.1)
+        left.append(clock.left)
+    ratio = np.array(left[:9]) / (pace * np.arange(9, 0, -1))
+    assert (ratio[2:] > 0.5).all()
+    assert (ratio[2:8] < 2).all()  # the last tenth of the share is for further units
+
+
+def test_corrections_for_perspective_are_a_stage_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[str] = []
+    enter = Monitor.enter
+
+    def noted(monitor: Monitor, name: str, *, units: int | None = None) -> None:
+        enter(monitor, name, units=units)
+        if monitor.current.name not in begun:
+            begun.append(monitor.current.name)
+
+    monkeypatch.setattr(Monitor, "enter", noted)
+    face = gallery.face(8, 60, degrees=70)
+    known = KnownCamera.from_arrays(face.rotations)
+    steps: list[Step] = []
+    solve(face.tracks, cameras=known, settings=Settings(focal=2000.0, image_size=(640, 480)), on_step=steps.append)
+    assert begun[-4:] == ["shapes", "corrections", "finish", "trust"]
+    fractions = [step.fraction for step in steps]
+    assert fractions == sorted(fractions)
+    begun.clear()
+    solve(face.tracks, cameras=known, settings=Settings(camera="orthographic"))
+    assert begun[-3:] == ["shapes", "finish", "trust"]
 
 
 def test_progress_accounts_for_growing_unit_times_and_setup() -> None:
@@ -334,7 +325,7 @@ def test_a_step_that_raises_the_objective_is_rejected_and_reported(monkeypatch: 
 def timed(plan: list[Stage]) -> tuple[Monitor, list[Step], list[float]]:
     steps: list[Step] = []
     now = [0.0]
-    return Monitor(steps.append, plan=plan, clock=lambda: now[0], work=lambda: now[0]), steps, now
+    return Monitor(steps.append, plan=plan, clock=lambda: now[0]), steps, now
 
 
 def test_remaining_time_scales_with_the_measured_pace() -> None:
@@ -352,45 +343,18 @@ def test_remaining_time_scales_with_the_measured_pace() -> None:
     assert steps[-1].seconds_left == 0.0
 
 
-def test_remaining_time_follows_the_latest_machine_load() -> None:
-    steps: list[Step] = []
-    now, work = [0.0], [0.0]
-    plan = [Stage("multistart", 100.0, 100)]
-    monitor = Monitor(steps.append, plan=plan, clock=lambda: now[0], work=lambda: work[0])
-    left = []
-    for slow in [1] * 10 + [4] * 10:  # other processes take the cores
-        work[0] += 5.0
-        now[0] += 5.0 * slow
-        monitor()
-        assert steps[-1].seconds_left is not None
-        left.append(steps[-1].seconds_left)
-    assert left[9] == pytest.approx(5 * 90, rel=0.2)
-    assert left[19] == pytest.approx(4 * 5 * 80, rel=0.2)
-
-
-def test_a_slow_shapes_stage_is_extrapolated_separately() -> None:
+def test_a_stage_that_takes_longer_than_planned_is_extrapolated_from_its_units() -> None:
     monitor, steps, now = timed([Stage("multistart", 10.0, 10), Stage("shapes", 1.0, 100), Stage("trust", 1.0, 10)])
     for unit in range(10):
         now[0] = unit + 1.0
         monitor()
-    monitor.report(Step("initialise", 0.0, objective=1.0))
-    for unit in range(5):
-        now[0] = 12.0 + 2 * unit
+    monitor.enter("shapes")
+    for _ in range(20):
+        now[0] += 2
         monitor()
-    now[0] = 21.0
-    monitor.report(Step("reweight", 0.0, objective=0.5))
     left = steps[-1].seconds_left
     assert left is not None
-    assert 30 < left < 70, "the first of about six reweightings has taken eleven seconds"
-    for objective in (0.1, 0.05, 0.04999999):
-        now[0] += 10
-        for _ in range(5):
-            monitor()
-        monitor.report(Step("reweight", 0.0, objective=objective))
-    monitor.enter("trust")
-    now[0] += 0.1
-    monitor()
-    assert steps[-1].seconds_left == pytest.approx(0.9, rel=0.3), "slow shapes do not slow the rest down"
+    assert 120 < left < 200, "80 units of 2 s"
 
 
 def places(tracks: Tracks, settings: Settings, cameras: KnownCamera | None = None) -> dict[str, int]:
