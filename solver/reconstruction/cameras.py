@@ -19,7 +19,9 @@ from pliant.solver.reconstruction.observations import Observations, OnStep, Shou
 from pliant.solver.records import MIN_POINTS, Camera, Floats, KnownCamera, Step, Tracks, read_only
 from pliant.solver.refinement.covariance_learning import LearningData, learn_covariance
 from pliant.solver.refinement.depth_rounds import settled
+from pliant.solver.refinement.evidence import Evidence
 from pliant.solver.refinement.joint_refinement import refine_cameras
+from pliant.solver.refinement.learned import Refinement
 from pliant.solver.refinement.observed import Observed, cross_fitted
 from pliant.solver.settings import Settings
 from pliant.solver.stages import stage_of
@@ -179,10 +181,9 @@ def _with_shapes(
         )  # fmt: skip
     elif observations.lens is not None:
         used = np.flatnonzero(shown)
-        estimate = settled(
-            estimate, normalized, used[evenly_spread(len(used), LEARNED_FRAMES)], model_order=ModelOrder(ordered=estimate.ordered),
-            turning=observations.turning, should_stop=monitor,
-        )  # fmt: skip
+        some = used[evenly_spread(len(used), LEARNED_FRAMES)]
+        how = Refinement(ModelOrder(ordered=estimate.ordered), turning=observations.turning, should_stop=monitor)
+        estimate = settled(Evidence.of(estimate, normalized, some, np.asarray(estimate.scales)), how).estimate
     return estimate, data
 
 

@@ -23,7 +23,7 @@ from pliant.solver.monitor import enter
 from pliant.solver.reconstruction.observations import Observations
 from pliant.solver.records import Floats, read_only
 from pliant.solver.refinement.covariance_learning import LearningData
-from pliant.solver.refinement.learned import Learned, turned_once
+from pliant.solver.refinement.learned import Learned, Refinement
 from pliant.solver.tracks.completion import Filling, gross
 
 PREDICTED_TOGETHER = 256
@@ -71,10 +71,8 @@ def extended(
     if turning:
         sample = _completed(views, shapes, poses)
         start = Learned(poses.rotations, poses.scales, replace(covariance, modes=poses.coefficients), np.inf)
-        moved = turned_once(
-            np.zeros((0, 0)), start, with_scales=with_scales,
-            factor=columns(sample) / sample.shape[1] ** 0.5, should_stop=should_stop,
-        )  # fmt: skip
+        how = Refinement(with_scales=with_scales, should_stop=should_stop)
+        moved = how.refined_once(np.zeros((0, 0)), start, factor=columns(sample) / sample.shape[1] ** 0.5)
         poses = replace(poses, rotations=moved.rotations, scales=moved.scales * np.exp(np.log(poses.scales).mean()))
         poses = resected(views, shapes, poses, turning=False, with_scales=False, should_stop=should_stop)
     return _whole(estimate, covariance, observations, views, shapes, poses, begun)

@@ -8,13 +8,11 @@ refinement hardly turns them; a few of these iterations lead to within 2° to 6�
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from pliant.solver.cameras.factorization import upgrade
 from pliant.solver.cameras.perspective import Perspective, centred, columns, corrected, depth_map, depths_of
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.records import Floats
 from pliant.solver.refinement.depth_alternation import aligned
 from pliant.solver.refinement.focal_length import (
@@ -24,7 +22,7 @@ from pliant.solver.refinement.focal_length import (
     compared_frames,
     refined_with_focal,
 )
-from pliant.solver.refinement.learned import Learned, annealed_at
+from pliant.solver.refinement.learned import Learned, Refinement
 
 SIZES = (2, 5)
 """K of the factorizations. A rigid object (K = 1) deforms too little to need them; with 3 and 8 as well, errors are about the same."""
@@ -52,9 +50,7 @@ def affine_iterations(
     rotations: Floats,
     scales: Floats,
     view: Perspective,
-    *,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None = None,
+    how: Refinement,
 ) -> tuple[Learned, float] | None:
     """Return cameras, covariance and κ of the most probable iterations; None if the search for κ from `rotations` found more probable ones.
 
@@ -68,17 +64,15 @@ def affine_iterations(
         Scales, which are kept.
     view : Perspective
         Result of the search: its κ with `candidates`, given κ, and signs of κ to try.
-    model_order : ModelOrder
-        Maximum number of modes, and the starting noise.
-    should_stop : callable, optional
-        Called for every K; once it returns True, the best so far is returned.
+    how : Refinement
+        How covariances are learned, and when to stop.
     """
     used = compared_frames(views)
-    part = _Iterations(views[used], rotations[used], scales[used], model_order)
+    part = _Iterations(views[used], rotations[used], scales[used], how)
     first = FIRST_CURVATURE if view.given is None else view.given
     trials: list[_Trial] = []
     for size in SIZES:
-        if (should_stop is not None and should_stop()) or 3 * size > min(2 * len(used), views.shape[1]):
+        if how.stopped() or 3 * size > min(2 * len(used), views.shape[1]):
             break
         start = part.factorized(size)
         trials += [part.iterated(size, sign * first, start) for sign in view.signs]
@@ -89,7 +83,7 @@ def affine_iterations(
         best = _continued(part, best)
     if best.nll >= min((each.nll for each in view.candidates if each.curvature == view.curvature), default=np.inf):
         return None
-    every = _Iterations(views, rotations, scales, model_order)
+    every = _Iterations(views, rotations, scales, how)
     return every.iterated(best.size, best.curvature, every.factorized(best.size)).found, best.curvature
 
 
@@ -115,7 +109,7 @@ class _Iterations:
     views: Floats
     rotations: Floats
     scales: Floats
-    model_order: ModelOrder
+    how: Refinement
 
     def factorized(self, size: int) -> Learned:
         """Return cameras and covariance from the uncorrected tracks."""
@@ -133,10 +127,9 @@ class _Iterations:
         return self._rated(size, curvature, found)
 
     def _rated(self, size: int, curvature: float, found: Learned) -> _Trial:
-        zooms = bool((self.scales != 1).any())
         try:
             refined, _ = refined_with_focal(
-                self.views, found, curvature, free=False, turning=True, with_scales=zooms, iterations=SEARCH_ITERATIONS
+                self.views, found, curvature, free=False, turning=True, iterations=SEARCH_ITERATIONS
             )
         except np.linalg.LinAlgError:  # the depths diverge
             return _Trial(size, curvature, found, np.inf)
@@ -146,4 +139,4 @@ class _Iterations:
         rows = columns(centred(images)) / np.repeat(self.scales, 2)[:, None]
         rotations = upgrade(rows @ rows.T / rows.shape[1], size).rotations
         turned = aligned(rotations, like, np.arange(len(images)))
-        return annealed_at(images, turned, self.scales, self.model_order, iterations=SEARCH_EM_ROUNDS)
+        return self.how.annealed(images, turned, self.scales, iterations=SEARCH_EM_ROUNDS)

@@ -7,7 +7,6 @@ the perspective is gone. The alternation continues from the most probable factor
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,11 +15,10 @@ from pliant.solver.cameras.aimed import Aimed, towards
 from pliant.solver.cameras.factorization import upgrades
 from pliant.solver.cameras.multistart import CANDIDATES
 from pliant.solver.cameras.perspective import Perspective, centred, columns, corrected, depths_of
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.so3 import MIRROR, nearest
 from pliant.solver.records import Floats
 from pliant.solver.refinement.focal_length import refined_with_focal
-from pliant.solver.refinement.learned import Learned, annealed_at
+from pliant.solver.refinement.learned import Learned, Refinement
 from pliant.solver.tracks.frame_selection import evenly_spread
 
 ALTERNATION_ROUNDS = 3
@@ -37,11 +35,9 @@ def alternated(
     view: Perspective,
     found: Learned,
     used: NDArray[np.intp],
+    how: Refinement,
     *,
-    model_order: ModelOrder,
-    turning: bool,
     rounds: int = ALTERNATION_ROUNDS,
-    should_stop: Callable[[], bool] | None = None,
 ) -> tuple[Learned, Perspective]:
     """Return cameras, covariance and κ after rounds of alternation, which end before a round whose depths diverge.
 
@@ -53,23 +49,23 @@ def alternated(
         Starting cameras and covariance, at the frames used.
     used : array of int, shape (F',)
         Indices of the frames used.
-    model_order : ModelOrder
-        Maximum number of modes, and the starting noise.
-    turning : bool
-        False keeps the rotations.
+    how : Refinement
+        What is refined; scales are if any differs from 1.
     rounds : int
-        Number of rounds.
-    should_stop : callable, optional
-        Called between rounds; once it returns True, the best so far is returned.
+        Maximum number of rounds.
     """
+    views = view.sample[used]
     for _ in range(rounds):
-        if should_stop is not None and should_stop():
+        if how.stopped():
             break
         try:
-            found = _relearned(view, found, used, model_order, turning=turning)
+            found = _relearned(views, view.curvature, found, how)
         except np.linalg.LinAlgError:
             break
-        found, view = _with_focal(view, found, used, turning=turning)
+        found, curvature = refined_with_focal(
+            views, found, view.curvature, free=view.given is None, turning=how.turning
+        )
+        view = replace(view, curvature=curvature)
     return found, view
 
 
@@ -78,9 +74,7 @@ def factorized_again(
     view: Perspective,
     found: Learned,
     used: NDArray[np.intp],
-    *,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None = None,
+    how: Refinement,
 ) -> Floats | None:
     """Return the rotations `(F, 3, 3)` of the most probable factorization of the corrected tracks; None if `found` is more probable.
 
@@ -94,10 +88,8 @@ def factorized_again(
         Cameras and covariance, at the frames used. The factorizations are aligned to their world axes and sign of depth.
     used : array of int, shape (F',)
         Indices of the frames used.
-    model_order : ModelOrder
-        Maximum number of modes, and the starting noise.
-    should_stop : callable, optional
-        Called between factorizations; once it returns True, the best so far is returned.
+    how : Refinement
+        What the comparison refines; must turn.
     """
     places = evenly_spread(len(used), COMPARED_FRAMES)
     some = used[places]
@@ -107,7 +99,7 @@ def factorized_again(
     )  # fmt: skip
 
     def energy(start: Learned) -> float:
-        moved, _ = alternated(view, start, some, model_order=model_order, turning=True, rounds=1)
+        moved, _ = alternated(view, start, some, replace(how, should_stop=None), rounds=1)
         return moved.energy
 
     turns = towards(view.sample.mean(axis=1), view.curvature)
@@ -116,7 +108,7 @@ def factorized_again(
     limit = min(len(gram) // 3, view.sample.shape[1] // 3)
     best, lowest = None, energy(part)
     for each in upgrades(gram, [size for size in CANDIDATES if size <= limit]):
-        if should_stop is not None and should_stop():
+        if how.stopped():
             break
         rotations = turns.transpose(0, 2, 1) @ aligned(each.rotations, turns[used] @ found.rotations, used)
         reached = energy(replace(part, rotations=rotations[some]))
@@ -142,25 +134,11 @@ def aligned(rotations: Floats, like: Floats, used: NDArray[np.intp]) -> Floats:
     return np.asarray(min(choices, key=lambda choice: choice[0])[1])
 
 
-def _relearned(
-    view: Perspective, found: Learned, used: NDArray[np.intp], model_order: ModelOrder, *, turning: bool
-) -> Learned:
-    views = view.sample[used]
-    aimed = Aimed.of(views, view.curvature) if turning else Aimed.unturned(views)
+def _relearned(views: Floats, curvature: float, found: Learned, how: Refinement) -> Learned:
+    """Return `found` with the covariance of the tracks corrected with its depths; `views` has shape `(F', S, 2)`."""
+    aimed = Aimed.of(views, curvature) if how.turning else Aimed.unturned(views)
     rotations = aimed.turned(found.rotations)
-    depth = aimed.depth_map(rotations, found.scales, found.covariance)
-    again = annealed_at(
-        corrected(aimed.views, depths_of(depth, aimed.views, view.curvature), view.curvature), rotations, found.scales,
-        model_order, iterations=ALTERNATION_EM_ROUNDS,
-    )  # fmt: skip
+    depths = depths_of(aimed.depth_map(rotations, found.scales, found.covariance), aimed.views, curvature)
+    flat = corrected(aimed.views, depths, curvature)
+    again = how.annealed(flat, rotations, found.scales, iterations=ALTERNATION_EM_ROUNDS)
     return replace(found, covariance=again.covariance)
-
-
-def _with_focal(
-    view: Perspective, found: Learned, used: NDArray[np.intp], *, turning: bool
-) -> tuple[Learned, Perspective]:
-    zooms = bool((found.scales != 1).any())
-    found, curvature = refined_with_focal(
-        view.sample[used], found, view.curvature, free=view.given is None, turning=turning, with_scales=zooms
-    )
-    return found, replace(view, curvature=curvature)

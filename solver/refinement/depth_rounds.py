@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import Perspective, corrected_moments, depth_map, mirrored
 from pliant.solver.cameras.planar_ambiguity import is_planar
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR
 from pliant.solver.records import Floats, read_only
 from pliant.solver.refinement.affine_iterations import affine_iterations
 from pliant.solver.refinement.bas_relief import LOG_DEPTH_STD
 from pliant.solver.refinement.depth_alternation import alternated, factorized_again
+from pliant.solver.refinement.evidence import Evidence
 from pliant.solver.refinement.focal_length import search
-from pliant.solver.refinement.learned import Learned, stretched
+from pliant.solver.refinement.learned import Learned, Refinement, stretched
 from pliant.solver.tracks.completion import briefly_hidden
-from pliant.solver.tracks.normalization import Normalized
 
 RESTARTS = 3
 """Maximum number of restarts of the alternation from cameras of the corrected tracks; the evidence converges after one or two."""
@@ -30,153 +27,92 @@ MIN_GAIN = 0.01
 from different starts differ by as much."""
 
 
-def settled(
-    estimate: CameraEstimate,
-    normalized: Normalized,
-    used: NDArray[np.intp],
-    *,
-    model_order: ModelOrder,
-    turning: bool,
-    should_stop: Callable[[], bool] | None = None,
-) -> CameraEstimate:
-    """Return the estimate with κ determined and the tracks corrected; if κ is 0, only `perspective` is updated.
+def settled(evidence: Evidence, how: Refinement) -> Evidence:
+    """Return the evidence with κ determined and the tracks corrected; if κ is 0, only `perspective` is updated.
 
     Parameters
     ----------
-    estimate : CameraEstimate
-        Estimate from the uncorrected tracks; `perspective` has the given parameters.
-    normalized : Normalized
-        The uncorrected tracks.
-    used : array of int, shape (F',)
-        Frames to learn from.
-    model_order : ModelOrder
-        Maximum number of modes, and the starting noise.
-    turning : bool
-        False keeps the rotations, except for the sign of depth.
-    should_stop : callable, optional
-        Called between fits; once it returns True, the best so far is returned.
+    evidence : Evidence
+        Uncorrected tracks; `perspective` has the given parameters. The starting scales are those of the estimate.
+    how : Refinement
+        What is refined; scales are if any differs from 1.
     """
+    estimate, used = evidence.estimate, evidence.used
     assert estimate.perspective is not None
     whole = estimate.sample + (estimate.perspective.offsets + estimate.translations)[:, None]
-    briefly = briefly_hidden(normalized.visible)[estimate.sampled]
+    briefly = briefly_hidden(evidence.normalized.visible)[estimate.sampled]
     view = replace(estimate.perspective, filling=estimate.filling, sample=whole[:, briefly], whole=whole)
-    rotations, scales = np.asarray(estimate.rotations), np.asarray(estimate.scales)
-    view, found = search(
-        view.sample[used], rotations[used], scales[used], view,
-        model_order=model_order, turning=turning, should_stop=should_stop,
-    )  # fmt: skip
+    cameras = view.sample[used], evidence.rotations, evidence.start_scales[used]
+    view, found = search(*cameras, view, how)
     if not view.bends:
-        return replace(estimate, perspective=view)
-    reached, best = _converged(
-        estimate, normalized, used, found, view, model_order=model_order, turning=turning, should_stop=should_stop
-    )
-    if not turning or is_planar(reached.gram):
+        return replace(evidence, estimate=replace(estimate, perspective=view))
+    reached, best = _converged(evidence, found, view, how)
+    if not how.turning or is_planar(reached.estimate.gram):
         return reached
-    reached, best = _restarted(reached, normalized, used, best, model_order=model_order, should_stop=should_stop)
-    start = affine_iterations(
-        view.sample[used], rotations[used], scales[used], view, model_order=model_order, should_stop=should_stop
-    )
+    reached, best = _restarted(reached, best, how)
+    start = affine_iterations(*cameras, view, how)
     if start is None:
         return reached
     found, curvature = start
-    other, found = _converged(
-        estimate, normalized, used, found, replace(view, curvature=curvature),
-        model_order=model_order, turning=True, should_stop=should_stop,
-    )  # fmt: skip
-    other, found = _restarted(other, normalized, used, found, model_order=model_order, should_stop=should_stop)
+    other, found = _restarted(*_converged(evidence, found, replace(view, curvature=curvature), how), how)
     return other if found.energy < best.energy - MIN_GAIN else reached
 
 
-def _converged(
-    estimate: CameraEstimate,
-    normalized: Normalized,
-    used: NDArray[np.intp],
-    found: Learned,
-    view: Perspective,
-    *,
-    model_order: ModelOrder,
-    turning: bool,
-    should_stop: Callable[[], bool] | None,
-) -> tuple[CameraEstimate, Learned]:
-    """Return the estimate with the tracks corrected after alternation from `found` and κ, with κ positive where z points away."""
+def _converged(evidence: Evidence, found: Learned, view: Perspective, how: Refinement) -> tuple[Evidence, Learned]:
+    """Return the evidence with the tracks corrected after alternation from `found` and κ, with κ positive where z points away."""
     if view.curvature * view.signs[0] < 0:
         view = replace(view, curvature=-view.curvature, flipped=-1)
         turned, covariance = mirrored(found.rotations, found.covariance)
         found = replace(found, rotations=turned, covariance=covariance)
+        estimate = evidence.estimate
         estimate = replace(estimate, rotations=MIRROR @ np.asarray(estimate.rotations) @ MIRROR)
-    found, view = alternated(view, found, used, model_order=model_order, turning=turning, should_stop=should_stop)
-    return _applied(estimate, normalized, used, found, view), found
+        evidence = replace(evidence, estimate=estimate)
+    found, view = alternated(view, found, evidence.used, how)
+    return _applied(evidence, found, view), found
 
 
-def _restarted(
-    estimate: CameraEstimate,
-    normalized: Normalized,
-    used: NDArray[np.intp],
-    found: Learned,
-    *,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None = None,
-) -> tuple[CameraEstimate, Learned]:
-    """Return the estimate after alternations from cameras of the corrected tracks, repeated while the evidence rises.
+def _restarted(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evidence, Learned]:
+    """Return the evidence after alternations from cameras of the corrected tracks, repeated while the likelihood rises.
 
     `found` holds the estimate's cameras and covariance at the frames used, and is returned refined.
     """
-    scales = np.asarray(estimate.scales)
+    used, scales = evidence.used, evidence.start_scales
     for _ in range(RESTARTS):
-        view = estimate.perspective
+        view = evidence.estimate.perspective
         assert view is not None
-        rotations = factorized_again(scales, view, found, used, model_order=model_order, should_stop=should_stop)
+        rotations = factorized_again(scales, view, found, used, how)
         if rotations is None:
             break
-        start = replace(found, rotations=rotations[used])
-        other, moved = alternated(view, start, used, model_order=model_order, turning=True, should_stop=should_stop)
+        other, moved = alternated(view, replace(found, rotations=rotations[used]), used, how)
         gain = found.energy - other.energy
         if gain <= 0:
             break
-        estimate, found = _applied(replace(estimate, rotations=rotations), normalized, used, other, moved), other
+        evidence = replace(evidence, estimate=replace(evidence.estimate, rotations=rotations))
+        evidence, found = _applied(evidence, other, moved), other
         if gain < MIN_GAIN:
             break
-    return estimate, found
+    return evidence, found
 
 
-def settled_again(
-    estimate: CameraEstimate,
-    normalized: Normalized,
-    used: NDArray[np.intp],
-    found: Learned,
-    scales: Floats,
-    *,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None = None,
-) -> tuple[CameraEstimate, Learned]:
-    """Return the estimate with tracks corrected for the refined cameras and covariance, and these refined once more.
-
-    `found` belongs to tracks divided by `scales`, shape `(F',)`.
-    """
-    view = estimate.perspective
+def settled_again(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evidence, Learned]:
+    """Return the evidence with tracks corrected for refined cameras and covariance `found`, and these refined once more."""
+    view, scales = evidence.estimate.perspective, evidence.start_scales[evidence.used]
     assert view is not None
     whole = replace(found, scales=found.scales * scales)
-    whole, view = alternated(view, whole, used, model_order=model_order, turning=True, should_stop=should_stop)
-    return _applied(estimate, normalized, used, whole, view), replace(whole, scales=whole.scales / scales)
+    whole, view = alternated(view, whole, evidence.used, how)
+    return _applied(evidence, whole, view), replace(whole, scales=whole.scales / scales)
 
 
-def with_stretched_depth(
-    estimate: CameraEstimate,
-    normalized: Normalized,
-    used: NDArray[np.intp],
-    found: Learned,
-    scales: Floats,
-    stretch: float,
-) -> CameraEstimate:
-    """Return the estimate with the depths of `found`, λ = `stretch` times the previous ones, and κ/λ, which change the tracks alike.
+def with_stretched_depth(evidence: Evidence, found: Learned, stretch: float) -> Evidence:
+    """Return the evidence with the depths of `found`, λ = `stretch` times the previous ones, and κ/λ, which change the tracks alike.
 
-    `found` belongs to tracks divided by `scales`, shape `(F',)`. The prior on the depth determines κ only as well as the depth.
+    The prior on the depth determines κ only as well as the depth.
     """
-    view = estimate.perspective
+    view = evidence.estimate.perspective
     assert view is not None
     curvature, std = view.curvature / stretch, (view.curvature_std or 0.0) / stretch
     view = replace(view, curvature=curvature, curvature_std=float(np.hypot(std, LOG_DEPTH_STD * curvature)))
-    return _applied(estimate, normalized, used, replace(found, scales=found.scales * scales), view)
+    return _applied(evidence, replace(found, scales=found.scales * evidence.start_scales[evidence.used]), view)
 
 
 def with_depth_map(
@@ -190,14 +126,14 @@ def with_depth_map(
     return replace(estimate, perspective=replace(view, depth=depth))
 
 
-def _applied(
-    estimate: CameraEstimate, normalized: Normalized, used: NDArray[np.intp], found: Learned, view: Perspective
-) -> CameraEstimate:
-    """Return the estimate with the rotations found, and with Gram matrix, sample and translations of the corrected tracks."""
-    every = stretched(found, used, np.asarray(estimate.rotations))
+def _applied(evidence: Evidence, found: Learned, view: Perspective) -> Evidence:
+    """Return the evidence with the rotations found and the tracks corrected with the depths found; `found` has absolute scales."""
+    every = stretched(found, evidence.used, np.asarray(evidence.estimate.rotations))
     view = replace(view, depth=depth_map(every.rotations, every.scales, every.covariance))
-    gram, translations, sample = corrected_moments(view, normalized)
+    gram, translations, sample = corrected_moments(view, evidence.normalized)
     read_only(every.rotations)
-    return replace(
-        estimate, rotations=every.rotations, gram=gram, translations=translations, sample=sample, perspective=view
+    return evidence.corrected(
+        replace(
+            evidence.estimate, rotations=every.rotations, gram=gram, translations=translations, sample=sample, perspective=view
+        )
     )  # fmt: skip

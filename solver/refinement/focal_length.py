@@ -17,7 +17,7 @@ where d′ is the derivative of the density of the turn. Known rotations are not
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -35,10 +35,9 @@ from pliant.solver.cameras.perspective import (
 )
 from pliant.solver.model.image_density import factor_of
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, UNLIKELY, Motion, energy_with_inverse
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.records import Floats
-from pliant.solver.refinement.learned import Learned, annealed_at, motion_of, moved_to, scene_at, stretched
+from pliant.solver.refinement.learned import Learned, Refinement, motion_of, moved_to, scene_at, stretched
 from pliant.solver.tracks.frame_selection import evenly_spread
 from scipy.optimize import minimize
 
@@ -92,10 +91,7 @@ def search(
     rotations: Floats,
     scales: Floats,
     view: Perspective,
-    *,
-    model_order: ModelOrder,
-    turning: bool,
-    should_stop: Callable[[], bool] | None = None,
+    how: Refinement,
 ) -> tuple[Perspective, Learned]:
     """Return the perspective with the best κ, 0 unless the tracks need perspective, and cameras and covariance refined with it.
 
@@ -109,30 +105,22 @@ def search(
         Their scales.
     view : Perspective
         Given parameters. The `curvature` returned has the sign opposite to `signs[0]` if depths must be mirrored.
-    model_order : ModelOrder
-        Maximum number of modes, and the starting noise.
-    turning : bool
-        False keeps the rotations.
-    should_stop : callable, optional
-        Called between values of κ; once it returns True, the best so far is used.
+    how : Refinement
+        What is refined; scales are if any differs from 1.
     """
     used = compared_frames(views)
-    comparison = _Comparison.of(views[used], rotations[used], scales[used], model_order, turning=turning)
-
-    def stopped() -> bool:
-        return should_stop is not None and should_stop()
-
+    comparison = _Comparison.of(views[used], rotations[used], scales[used], how)
     for size, sign in _walk(view, comparison.trials):
-        if stopped():
+        if how.stopped():
             break
         comparison.add(sign * size)
     for _ in range(MAX_POLISHES if view.given is None and _promising(view, comparison.trials) else 0):
         middle = _between(comparison.trials)
-        if middle is None or stopped():
+        if middle is None or how.stopped():
             break
         comparison.add(middle)
     if _promising(view, comparison.trials):
-        comparison.level(stopped)
+        comparison.level()
     view = _decided(view, comparison.trials, len(used), views.shape[1])
     found = comparison.trials[view.curvature if view.curvature in comparison.trials else 0.0].found
     return view, stretched(found, used, rotations)
@@ -148,16 +136,14 @@ class _Comparison:
     """Values of κ compared on some frames; each continues from a neighbour."""
 
     views: Floats
-    turning: bool
+    how: Refinement
     trials: dict[float, _Trial]
 
     @classmethod
-    def of(
-        cls, views: Floats, rotations: Floats, scales: Floats, model_order: ModelOrder, *, turning: bool
-    ) -> _Comparison:
+    def of(cls, views: Floats, rotations: Floats, scales: Floats, how: Refinement) -> _Comparison:
         """Learn the covariance for κ = 0 from scratch."""
-        comparison = cls(views, turning, {})
-        flat = _Trial(0.0, np.inf, annealed_at(views, rotations, scales, model_order, iterations=SEARCH_EM_ROUNDS))
+        comparison = cls(views, how, {})
+        flat = _Trial(0.0, np.inf, how.annealed(views, rotations, scales, iterations=SEARCH_EM_ROUNDS))
         comparison.trials[0.0] = comparison._continued(flat, 0.0)
         return comparison
 
@@ -166,14 +152,14 @@ class _Comparison:
         nearest = max((each for each in self.trials if 0 <= each / curvature < 1), key=abs)
         self.trials[curvature] = self._continued(self.trials[nearest], curvature)
 
-    def level(self, stopped: Callable[[], bool]) -> None:
+    def level(self) -> None:
         """Continue every value of κ from both neighbours where that is more probable, so that all are refined equally well."""
         order = sorted(self.trials)
         middle = order.index(0.0)
         inwards = [*pairwise(order[: middle + 1]), *pairwise(order[: middle - 1 if middle else None : -1])]
         outwards = [(target, source) for source, target in reversed(inwards)]
         for source, target in inwards + outwards:
-            if stopped():
+            if self.how.stopped():
                 return
             found = self._continued(self.trials[source], target)
             if found.nll < self.trials[target].nll:
@@ -182,20 +168,13 @@ class _Comparison:
     def _continued(self, trial: _Trial, curvature: float) -> _Trial:
         """Return the trial of κ with depths, cameras and covariance refined from those of `trial`."""
         found = trial.found
-        zooms = bool((found.scales != 1).any())
-        if self.turning:
+        if self.how.turning:
             middle = self.views.mean(axis=1)
             turns = towards(middle, curvature).transpose(0, 2, 1) @ towards(middle, trial.curvature)
             found = replace(found, rotations=turns @ found.rotations)
         try:
             found, _ = refined_with_focal(
-                self.views,
-                found,
-                curvature,
-                free=False,
-                turning=self.turning,
-                with_scales=zooms,
-                iterations=SEARCH_ITERATIONS,
+                self.views, found, curvature, free=False, turning=self.how.turning, iterations=SEARCH_ITERATIONS
             )
         except np.linalg.LinAlgError:  # the depths diverge
             return _Trial(curvature, UNLIKELY, found)
@@ -330,7 +309,6 @@ def refined_with_focal(
     *,
     free: bool,
     turning: bool,
-    with_scales: bool,
     iterations: int = UPDATE_ITERATIONS,
 ) -> tuple[Learned, float]:
     """Return cameras, covariance and κ of higher likelihood, after one update of the depths.
@@ -340,21 +318,19 @@ def refined_with_focal(
     views : array, shape (F, S, 2)
         Complete tracks relative to the principal point, normalized units.
     found : Learned
-        Cameras and covariance to start from.
+        Cameras and covariance to start from; scales that are all 1 are kept.
     curvature : float
         κ to start from.
     free : bool
         False keeps κ.
     turning : bool
         False keeps the rotations.
-    with_scales : bool
-        False keeps the scales at 1.
     iterations : int
         L-BFGS iterations.
     """
     turns = towards(views.mean(axis=1), curvature)
     start = replace(found, rotations=turns @ found.rotations) if turning else found
-    energy = corrected_energy(views, curvature, start, with_scales=with_scales, turning=turning)
+    energy = corrected_energy(views, curvature, start, turning=turning)
     motion = motion_of(energy.scene, start)
     held = 0 if turning else 3 * len(views)
     given = np.append(motion.flat(), curvature)
@@ -378,12 +354,10 @@ class corrected_energy:  # noqa: N801
     """E of tracks corrected with fixed depths, as a function of the likelihood's parameters, followed by κ.
 
     The tracks are linear in the change of κ. With `turning`, they are turned towards the object (`cameras.aimed`), as are the cameras of
-    `found`. Rotations that are known are not: they would have to turn with κ.
+    `found`. Rotations that are known are not: they would have to turn with κ. Scales are free if any in `found` differs from 1.
     """
 
-    def __init__(
-        self, views: Floats, curvature: float, found: Learned, *, with_scales: bool, turning: bool = True
-    ) -> None:
+    def __init__(self, views: Floats, curvature: float, found: Learned, *, turning: bool = True) -> None:
         count = views.shape[1]
         aimed, slope, self.density_slope = Aimed.unturned(views), np.zeros_like(views), 0.0
         if turning:
@@ -393,7 +367,9 @@ class corrected_energy:  # noqa: N801
         plain, along = columns(centred(corrected(aimed.views, depths, curvature))), columns(centred(changed))
         self.depths, self.curvature, self.density = depths, curvature, aimed.density
         self.grams = (plain @ plain.T / count, (plain @ along.T + along @ plain.T) / count, along @ along.T / count)
-        self.scene = scene_at(self.grams[0], found.rotations, with_scales=with_scales, ordered=found.covariance.ordered)
+        self.scene = scene_at(
+            self.grams[0], found.rotations, with_scales=found.scaled, ordered=found.covariance.ordered
+        )
 
     def __call__(self, flat: Floats) -> tuple[float, Floats]:
         """Return E and its gradient."""

@@ -6,15 +6,13 @@ The likelihood penalises each mode of deformation, so it distinguishes a camera 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pliant.solver.cameras.scale import WIDEST, rigid_scales
 from pliant.solver.model.marginal_likelihood import Scene, cameras_of, fit, start
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.records import Floats
-from pliant.solver.refinement.learned import Learned, learned_at, turned
+from pliant.solver.refinement.learned import Learned, Refinement
 from pliant.solver.tracks.frame_selection import between, evenly_spread, of_frames
 
 SCALE_FRAMES = 120
@@ -52,42 +50,28 @@ class ScaleTrial:
     """Cameras and covariance of the frames compared, with scales of 1."""
 
 
-def try_free_scales(
-    gram: Floats,
-    rotations: Floats,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None,
-    *,
-    turning: bool = True,
-) -> ScaleTrial:
-    """Compare free scales with scales of 1 on a subset of the frames.
+def try_free_scales(gram: Floats, rotations: Floats, how: Refinement) -> ScaleTrial:
+    """Compare free scales with scales of 1 on a subset of the frames, whatever `how.with_scales`.
 
     Free scales start from 1 and from the scales of a rigid shape. Where they mistake deformation for scale, the result is a worse
-    minimum than with fixed scales, or nearly constant scales. With `turning` False, rotations are kept. The scales of a rigid shape
-    are then a poor start, because only they can absorb the deformation; scales fitted with smooth modes are a third start.
+    minimum than with fixed scales, or nearly constant scales. If rotations are kept, the scales of a rigid shape are a poor start,
+    because only they can absorb the deformation; scales fitted with smooth modes are a third start.
     """
     used = evenly_spread(len(rotations), SCALE_FRAMES)
     part, given, none = of_frames(gram, used), rotations[used], np.ones(len(used))
-
-    def turned_some(begun: Learned, *, with_scales: bool) -> Learned:
-        return turned(
-            part, begun, with_scales=with_scales, rounds=SCALE_ROUNDS, turning=turning, should_stop=should_stop
-        )
-
     starts = [none, rigid_scales(part, given)]
-    if not turning:
-        starts.append(_smooth_scales(part, given, ordered=model_order.ordered, should_stop=should_stop))
-    even, *others = (learned_at(part, given, scales, model_order, should_stop) for scales in starts)
-    fixed, runs = (
-        turned_some(even, with_scales=False),
-        [turned_some(each, with_scales=True) for each in (even, *others)],
-    )
+    if not how.turning:
+        starts.append(_smooth_scales(part, given, how))
+    even, *others = (how.learned(part, given, scales) for scales in starts)
+    fixed = replace(how, with_scales=False).refined(part, even, rounds=SCALE_ROUNDS)
+    free = replace(how, with_scales=True)
+    runs = [free.refined(part, each, rounds=SCALE_ROUNDS) for each in (even, *others)]
     best = min(runs, key=lambda run: run.energy)
     gain, logs = fixed.energy - best.energy, np.log(best.scales)
     extent = f"from {best.scales.min():.3f} to {best.scales.max():.3f}"
     if logs.std() > WIDEST:
         return ScaleTrial(None, f"Every scale is 1: those found, {extent}, vary more than those of any camera.", fixed)
-    share = _scale_gain_share(logs) if model_order.ordered else 1.0
+    share = _scale_gain_share(logs) if how.model_order.ordered else 1.0
     if not (gain > MIN_SCALE_GAIN * share and logs.std() > MIN_SCALE_STD):
         reason = (
             f"Every scale is 1: a scale per frame, {extent}, would gain {gain:.3f} in the log likelihood, no more than deformation "
@@ -99,11 +83,11 @@ def try_free_scales(
     return ScaleTrial(np.exp(logs - logs.mean()), reason, fixed)
 
 
-def _smooth_scales(gram: Floats, rotations: Floats, *, ordered: bool, should_stop: Callable[[], bool] | None) -> Floats:
+def _smooth_scales(gram: Floats, rotations: Floats, how: Refinement) -> Floats:
     """Return the most probable scales for given rotations under smooth modes and large noise, shape `(F,)`."""
-    scene = Scene.of(gram, rotations, with_scales=True, ordered=ordered)
+    scene = Scene.of(gram, rotations, with_scales=True, ordered=how.model_order.ordered)
     begun = start(scene, np.ones(len(rotations)))
-    moved, _ = fit(scene, begun, iterations=SMOOTH_ITERATIONS, turning=False, should_stop=should_stop)
+    moved, _ = fit(scene, begun, iterations=SMOOTH_ITERATIONS, turning=False, should_stop=how.should_stop)
     return cameras_of(scene, moved)[1]
 
 

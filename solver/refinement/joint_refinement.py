@@ -26,7 +26,7 @@ from pliant.solver.refinement.covariance_learning import LearningData
 from pliant.solver.refinement.depth_rounds import settled, settled_again, with_stretched_depth
 from pliant.solver.refinement.evidence import Evidence
 from pliant.solver.refinement.free_scales import SCALE_ROUNDS, ScaleTrial, try_free_scales
-from pliant.solver.refinement.learned import Learned, learned_at, refined, scene_at, turned
+from pliant.solver.refinement.learned import Learned, Refinement, scene_at
 from pliant.solver.refinement.observed import Moments, Observed, on_observations
 from pliant.solver.refinement.starts import best_candidate, best_start
 from pliant.solver.stages import REFINEMENT_UNITS, UNITS_PER_START
@@ -73,94 +73,78 @@ def refine_cameras(
     should_stop : callable, optional
         Called between refinements; once it returns True, the best so far is returned.
     """
-    start = Evidence.of(estimate, normalized, np.flatnonzero(shown), np.asarray(estimate.scales))
+    evidence = Evidence.of(estimate, normalized, np.flatnonzero(shown), np.asarray(estimate.scales))
     enter(should_stop, "model_order")
     model_order = select_model_order(
-        start.sample, start.projections, ordered=estimate.ordered, seed=seed, should_stop=should_stop
+        evidence.sample, evidence.projections, ordered=estimate.ordered, seed=seed, should_stop=should_stop
     )
-    unsettled, start = start, _started(start, model_order, turning=turning, should_stop=should_stop)
-    estimate = start.estimate
+    how = Refinement(model_order, turning=turning, should_stop=should_stop)
+    estimates_scales = estimates_scales and bool((evidence.start_scales == 1).all())
     if not turning:
-        if estimates_scales and (start.start_scales == 1).all():
-            start = _with_free_scales(start, unsettled, model_order, should_stop)
-            estimate = start.estimate
-        projections = start.projections
-        if estimate.filling is not None:
-            found = learned_at(start.gram, start.rotations, np.ones(len(start.used)), model_order, should_stop)
-            start, found = _of_observations(start, found, with_scales=False, turning=False, should_stop=should_stop)
-            estimate = start.estimate
-        return estimate, LearningData(
-            start.gram, start.sample, projections, start.used, model_order, stopped=None,
-            rotations=np.asarray(estimate.rotations), scales=np.asarray(estimate.scales), turned=False,
-        )  # fmt: skip
-    trial = None
-    if estimates_scales and (start.start_scales == 1).all():
+        return _with_kept_rotations(evidence, how, estimates_scales=estimates_scales)
+    start, trial = _started(evidence, how), None
+    if estimates_scales:
         enter(should_stop, "scales")
-        trial = try_free_scales(start.gram, start.rotations, model_order, should_stop)
-    evidence, found = _refined(start, trial, model_order, should_stop)
+        trial = try_free_scales(start.gram, start.rotations, how)
+        how = replace(how, with_scales=trial.start is not None)
+    evidence, found = _refined(start, trial, how)
     if estimate.filling is not None and np.isfinite(found.energy):
-        evidence, found = _of_observations(
-            evidence, found, with_scales=trial is not None and trial.start is not None,
-            turning=True, should_stop=should_stop,
-        )  # fmt: skip
+        evidence, found = _of_observations(evidence, found, how)
         # The order limits the modes of completed tracks; expected moments include the uncertainty of hidden entries. Errors
         # without and with the limit: shark with all errors .063 and .088, face landmarks .027 and .024.
         model_order = replace(model_order, max_modes=MAX_MODES)
-    refined_estimate, rotations = _of_all_frames(start, evidence, found, trial)
+    estimate, rotations = _of_all_frames(start, evidence, found, trial)
     if not evidence.bends and not bulges(found, evidence.sample, y_up=y_up):
-        refined_estimate, rotations, found = _mirrored(refined_estimate, rotations, found)
-    return refined_estimate, LearningData(
-        evidence.gram, evidence.sample, found.rotations[:, :2] * found.scales[:, None, None], start.used, model_order,
+        estimate, rotations, found = _mirrored(estimate, rotations, found)
+    return estimate, LearningData(
+        evidence.gram, evidence.sample, found.rotations[:, :2] * found.scales[:, None, None], evidence.used, model_order,
         stopped=None if np.isfinite(found.energy) else found.covariance,
-        rotations=rotations, scales=np.asarray(refined_estimate.scales), turned=True,
+        rotations=rotations, scales=np.asarray(estimate.scales), turned=True,
     )  # fmt: skip
 
 
-def _started(
-    start: Evidence,
-    model_order: ModelOrder,
-    *,
-    turning: bool,
-    should_stop: Callable[[], bool] | None,
-) -> Evidence:
+def _with_kept_rotations(
+    uncorrected: Evidence, how: Refinement, *, estimates_scales: bool
+) -> tuple[CameraEstimate, LearningData]:
+    """Return what `refine_cameras` does if the rotations are kept."""
+    evidence = _started(uncorrected, how)
+    if estimates_scales:
+        evidence = _with_free_scales(evidence, uncorrected, how)
+    if evidence.estimate.filling is not None:
+        found = how.learned(evidence.gram, evidence.rotations, np.ones(len(evidence.used)))
+        evidence, _ = _of_observations(evidence, found, how)
+    estimate = evidence.estimate
+    return estimate, LearningData(
+        evidence.gram, evidence.sample, evidence.projections, evidence.used, how.model_order, stopped=None,
+        rotations=np.asarray(estimate.rotations), scales=np.asarray(estimate.scales), turned=False,
+    )  # fmt: skip
+
+
+def _started(start: Evidence, how: Refinement) -> Evidence:
     """Return the most probable start, with tracks corrected for perspective if needed."""
-    if turning and (others := len(start.estimate.hypotheses) + len(start.estimate.candidates)):
+    should_stop = how.should_stop
+    if how.turning and (others := len(start.estimate.hypotheses) + len(start.estimate.candidates)):
         enter(should_stop, "starts", units=UNITS_PER_START * (1 + others))
-        best = best_start(start.estimate, start.gram, start.used, model_order, should_stop)
-        start = replace(start, estimate=best)
+        start = replace(start, estimate=best_start(start, how))
     if start.estimate.perspective is None:
         return start
     enter(should_stop, "perspective")
-    return start.corrected(
-        settled(
-            start.estimate,
-            start.normalized,
-            start.used,
-            model_order=model_order,
-            turning=turning,
-            should_stop=should_stop,
-        )
-    )
+    return settled(start, how)
 
 
-def _with_free_scales(
-    settled: Evidence,
-    unsettled: Evidence,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None,
-) -> Evidence:
+def _with_free_scales(corrected: Evidence, uncorrected: Evidence, how: Refinement) -> Evidence:
     """Return the evidence for given rotations, with free scales if they gain more likelihood than chance.
 
-    `unsettled` has the uncorrected tracks, which are then corrected for perspective with these scales.
+    With free scales, the uncorrected tracks are corrected for perspective again.
     """
+    should_stop = how.should_stop
     enter(should_stop, "scales")
-    trial = try_free_scales(settled.gram, settled.rotations, model_order, should_stop, turning=False)
+    trial = try_free_scales(corrected.gram, corrected.rotations, how)
     if trial.start is None:
-        return replace(settled, estimate=_with_scale_reason(settled.estimate, trial))
-    scales = _at_all_frames(settled.used, trial.start, len(settled.start_scales))
-    estimate = replace(_with_scale_reason(unsettled.estimate, trial), scales=scales)
-    again = Evidence.of(estimate, settled.normalized, settled.used, scales)
-    return _started(again, model_order, turning=False, should_stop=should_stop)
+        return replace(corrected, estimate=_with_scale_reason(corrected.estimate, trial))
+    scales = _at_all_frames(corrected.used, trial.start, len(corrected.start_scales))
+    estimate = replace(_with_scale_reason(uncorrected.estimate, trial), scales=scales)
+    return _started(Evidence.of(estimate, corrected.normalized, corrected.used, scales), how)
 
 
 def _with_scale_reason(estimate: CameraEstimate, trial: ScaleTrial) -> CameraEstimate:
@@ -175,69 +159,40 @@ def _at_all_frames(used: NDArray[np.intp], scales: Floats, frames: int) -> Float
     return found
 
 
-def _refined(
-    evidence: Evidence,
-    trial: ScaleTrial | None,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None,
-) -> tuple[Evidence, Learned]:
+def _refined(evidence: Evidence, trial: ScaleTrial | None, how: Refinement) -> tuple[Evidence, Learned]:
     """Return the tracks, corrected with the refined depths, and the refined cameras and covariance of the frames used."""
-    estimate, with_scales, bends = evidence.estimate, trial is not None and trial.start is not None, evidence.bends
-    may_couple = model_order == ModelOrder(ordered=estimate.ordered)
+    estimate, bends, should_stop = evidence.estimate, evidence.bends, how.should_stop
+    may_couple = how.model_order == ModelOrder(ordered=estimate.ordered)
     enter(should_stop, "refinement", units=REFINEMENT_UNITS[may_couple])
-    found = _first_rounds(evidence, trial, model_order, should_stop)
+    found = _first_rounds(evidence, trial, how)
     if bends:
-        evidence, found = _with_settled_depths(evidence, found, model_order, should_stop)
+        evidence, found = settled_again(evidence, found, how)
     if may_couple and full_mode_covariance.is_identifiable(found.covariance, estimate.sample.shape[1]):
-        found = _coupled(evidence.gram, found, with_scales=with_scales, should_stop=should_stop)
+        found = _coupled(evidence.gram, found, how)
         if bends:
-            evidence, found = _with_settled_depths(evidence, found, model_order, should_stop)
+            evidence, found = settled_again(evidence, found, how)
     if not np.isfinite(found.energy):
         return evidence, found
-    if bends:
-        return _with_probable_focal(evidence, found)
-    return _with_probable_depth(evidence, found, model_order, should_stop)
+    return _with_probable_focal(evidence, found) if bends else _with_probable_depth(evidence, found, how)
 
 
-def _first_rounds(
-    evidence: Evidence, trial: ScaleTrial | None, model_order: ModelOrder, should_stop: Callable[[], bool] | None
-) -> Learned:
+def _first_rounds(evidence: Evidence, trial: ScaleTrial | None, how: Refinement) -> Learned:
     """Return cameras and covariance after `REFINEMENT_ROUNDS`, including those of the scale trial if it used the same frames."""
     count = len(evidence.used)
     if trial is not None and trial.start is None and len(trial.fixed.rotations) == count:
-        rounds = REFINEMENT_ROUNDS - SCALE_ROUNDS
-        return turned(evidence.gram, trial.fixed, with_scales=False, rounds=rounds, should_stop=should_stop)
-    scales = None if trial is None else trial.start
-    return refined(
-        evidence.gram, evidence.rotations, np.ones(count) if scales is None else scales,
-        with_scales=scales is not None, rounds=REFINEMENT_ROUNDS, model_order=model_order, should_stop=should_stop,
-    )  # fmt: skip
+        return how.refined(evidence.gram, trial.fixed, rounds=REFINEMENT_ROUNDS - SCALE_ROUNDS)
+    scales = np.ones(count) if trial is None or trial.start is None else trial.start
+    found = how.learned(evidence.gram, evidence.rotations, scales)
+    return how.refined(evidence.gram, found, rounds=REFINEMENT_ROUNDS)
 
 
-def _with_settled_depths(
-    evidence: Evidence,
-    found: Learned,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None,
-) -> tuple[Evidence, Learned]:
-    """Return the tracks, corrected with the depths of `found`, and `found` refined once more."""
-    used = evidence.used
-    estimate, found = settled_again(
-        evidence.estimate, evidence.normalized, used, found, evidence.start_scales[used],
-        model_order=model_order, should_stop=should_stop,
-    )  # fmt: skip
-    return evidence.corrected(estimate), found
-
-
-def _with_probable_depth(
-    evidence: Evidence, found: Learned, model_order: ModelOrder, should_stop: Callable[[], bool] | None
-) -> tuple[Evidence, Learned]:
+def _with_probable_depth(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evidence, Learned]:
     """Return cameras and covariance at the most probable depth; if the tracks hardly determine it, the best of all candidates."""
     found, stretch = settled_depth(evidence.gram, found)
-    estimate = _with_depth_choice(evidence.estimate, stretch)
-    if estimate.depth_is_typical:
-        found = best_candidate(estimate, evidence.gram, evidence.used, found, model_order, should_stop)
-    return replace(evidence, estimate=estimate), found
+    evidence = replace(evidence, estimate=_with_depth_choice(evidence.estimate, stretch))
+    if evidence.estimate.depth_is_typical:
+        found = best_candidate(evidence, found, how)
+    return evidence, found
 
 
 def _with_probable_focal(evidence: Evidence, found: Learned) -> tuple[Evidence, Learned]:
@@ -253,10 +208,8 @@ def _with_probable_focal(evidence: Evidence, found: Learned) -> tuple[Evidence, 
     moved, stretch = settled_depth(evidence.gram, found)
     if not is_typical(stretch):
         return evidence, found
-    estimate = with_stretched_depth(
-        evidence.estimate, evidence.normalized, evidence.used, moved, evidence.start_scales[evidence.used], stretch
-    )
-    return evidence.corrected(_with_depth_choice(estimate, stretch)), moved
+    evidence = with_stretched_depth(evidence, moved, stretch)
+    return replace(evidence, estimate=_with_depth_choice(evidence.estimate, stretch)), moved
 
 
 def _mirrored(estimate: CameraEstimate, rotations: Floats, found: Learned) -> tuple[CameraEstimate, Floats, Learned]:
@@ -280,36 +233,24 @@ def _of_all_frames(
     return _with_rotation_reason(estimate, rotations, np.asarray(start.estimate.rotations)), rotations
 
 
-def _of_observations(
-    evidence: Evidence,
-    found: Learned,
-    *,
-    with_scales: bool,
-    turning: bool,
-    should_stop: Callable[[], bool] | None,
-) -> tuple[Evidence, Learned]:
+def _of_observations(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evidence, Learned]:
     """Return cameras and covariance estimated from the observations themselves, without hidden or replaced entries."""
-    estimate, used = evidence.estimate, evidence.used
+    estimate, used, should_stop = evidence.estimate, evidence.used, how.should_stop
     enter(should_stop, "observations")
     translations = np.array(estimate.translations)
     completed = Moments(evidence.gram, evidence.sample, translations[used], estimate.outliers)
-    found, moments = on_observations(
-        Observed.of(evidence.normalized, estimate, used), found, completed, evidence.start_scales[used],
-        with_scales=with_scales, turning=turning, should_stop=should_stop,
-    )  # fmt: skip
+    observed = Observed.of(evidence.normalized, estimate, used)
+    found, moments = on_observations(observed, found, completed, evidence.start_scales[used], how)
     translations[used] = moments.translations
     estimate = replace(estimate, translations=translations)
     return replace(evidence, estimate=estimate, gram=moments.gram, sample=moments.sample), found
 
 
-def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Callable[[], bool] | None) -> Learned:
+def _coupled(gram: Floats, found: Learned, how: Refinement) -> Learned:
     """Return the cameras refined with a covariance between modes (`model.full_mode_covariance`), if they are more probable."""
-    scene = scene_at(gram, found.rotations, with_scales=with_scales, ordered=found.covariance.ordered)
-    rotations, scales = full_mode_covariance.refined(scene, found.scales, found.covariance, should_stop=should_stop)
-    again = refined(
-        gram, rotations, scales, with_scales=with_scales, rounds=COUPLED_ROUNDS,
-        model_order=ModelOrder(ordered=scene.ordered), should_stop=should_stop,
-    )  # fmt: skip
+    scene = scene_at(gram, found.rotations, with_scales=how.with_scales, ordered=found.covariance.ordered)
+    cameras = full_mode_covariance.refined(scene, found.scales, found.covariance, should_stop=how.should_stop)
+    again = how.refined(gram, how.learned(gram, *cameras), rounds=COUPLED_ROUNDS)
     return again if again.energy < found.energy else found
 
 

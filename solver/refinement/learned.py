@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,78 @@ class Learned:
 
     energy: float
     """Energy of `model.marginal_likelihood`, without a penalty on modes; infinite before the first refinement."""
+
+    @property
+    def scaled(self) -> bool:
+        """Whether any scale differs from 1."""
+        return bool((self.scales != 1).any())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refinement:
+    """What a refinement changes, how it learns the covariance, and when it stops."""
+
+    model_order: ModelOrder = field(default_factory=ModelOrder)
+    """Maximum number of modes, and the starting noise."""
+
+    turning: bool = True
+    """False keeps the rotations, except for the sign of depth."""
+
+    with_scales: bool = False
+    """Whether scales are refined; False keeps them at 1."""
+
+    should_stop: Callable[[], bool] | None = None
+    """Called between units of work; once it returns True, the best so far is returned."""
+
+    def stopped(self) -> bool:
+        """Call `should_stop`, if given, and return its answer."""
+        return self.should_stop is not None and self.should_stop()
+
+    def learned(self, gram: Floats, rotations: Floats, scales: Floats, *, iterations: int = START_EM_ROUNDS) -> Learned:
+        """Return given cameras and a covariance learned for them from scratch, in at most `iterations` EM rounds.
+
+        Parameters
+        ----------
+        gram : array, shape (2F, 2F)
+            W Wᵀ / P of centred, complete tracks, normalized units.
+        rotations : array, shape (F, 3, 3)
+            Camera from world.
+        scales : array, shape (F,)
+            Relative to those by which the tracks are divided.
+        iterations : int
+            Maximum number of EM rounds.
+        """
+        covariance = learned(
+            gram, rotations[:, :2] * scales[:, None, None], iterations=iterations, **asdict(self.model_order), should_stop=self.should_stop
+        )  # fmt: skip
+        return Learned(rotations, scales, covariance, np.inf)
+
+    def annealed(self, images: Floats, rotations: Floats, scales: Floats, *, iterations: int) -> Learned:
+        """Return what `learned` returns by annealing alone, without stops, from orthographic tracks `(F, S, 2)`."""
+        rows = columns(centred(images))
+        covariance = annealed(
+            rows @ rows.T / rows.shape[1], rotations[:, :2] * scales[:, None, None], iterations=iterations, **asdict(self.model_order)
+        )  # fmt: skip
+        return Learned(rotations, scales, covariance, np.inf)
+
+    def refined(self, gram: Floats, found: Learned, *, rounds: int) -> Learned:
+        """Return cameras and covariance after `rounds` calls of `refined_once`, fewer after a stop."""
+        for _ in range(rounds):
+            if self.stopped():
+                break
+            found = self.refined_once(gram, found)
+        return found
+
+    def refined_once(self, gram: Floats, found: Learned, *, factor: Floats | None = None) -> Learned:
+        """Return cameras and covariance of higher likelihood, by L-BFGS from `found`; `gram` and `factor` as for `scene_at`."""
+        ordered = found.covariance.ordered
+        scene = scene_at(gram, found.rotations, with_scales=self.with_scales, ordered=ordered, factor=factor)
+        motion = motion_of(scene, found)
+        moved = fit(
+            scene, motion, iterations=ROTATION_ITERATIONS, turning=self.turning, metric=metric_of(scene, motion),
+            should_stop=self.should_stop,
+        )  # fmt: skip
+        return moved_to(scene, found, *moved)
 
 
 def scene_at(
@@ -86,59 +158,6 @@ def moved_to(scene: Scene, found: Learned, moved: Motion, energy: float) -> Lear
     return Learned(*cameras_of(scene, moved), better, energy)
 
 
-def refined(
-    gram: Floats,
-    rotations: Floats,
-    scales: Floats,
-    *,
-    with_scales: bool,
-    rounds: int,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None = None,
-) -> Learned:
-    """Return cameras and covariance after rounds of alternating refinement; scales stay 1 without `with_scales`."""
-    start = learned_at(gram, rotations, scales, model_order, should_stop)
-    return turned(gram, start, with_scales=with_scales, rounds=rounds, should_stop=should_stop)
-
-
-def learned_at(
-    gram: Floats,
-    rotations: Floats,
-    scales: Floats,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None,
-    *,
-    iterations: int = START_EM_ROUNDS,
-) -> Learned:
-    """Return given cameras and a covariance learned for them from scratch, in at most `iterations` EM rounds."""
-    covariance = learned(
-        gram,
-        rotations[:, :2] * scales[:, None, None],
-        max_modes=model_order.max_modes,
-        noisy_start=model_order.noisy_start,
-        ordered=model_order.ordered,
-        iterations=iterations,
-        should_stop=should_stop,
-    )
-    return Learned(rotations, scales, covariance, np.inf)
-
-
-def annealed_at(
-    images: Floats, rotations: Floats, scales: Floats, model_order: ModelOrder, *, iterations: int
-) -> Learned:
-    """Return given cameras and a covariance learned for them from scratch, by annealing, from orthographic tracks `(F, S, 2)`."""
-    rows = columns(centred(images))
-    covariance = annealed(
-        rows @ rows.T / rows.shape[1],
-        rotations[:, :2] * scales[:, None, None],
-        max_modes=model_order.max_modes,
-        noisy_start=model_order.noisy_start,
-        ordered=model_order.ordered,
-        iterations=iterations,
-    )
-    return Learned(rotations, scales, covariance, np.inf)
-
-
 def stretched(found: Learned, used: NDArray[np.intp], rotations: Floats) -> Learned:
     """Return cameras and covariance of all frames, given those at the frames used and previous rotations of all frames.
 
@@ -153,44 +172,3 @@ def stretched(found: Learned, used: NDArray[np.intp], rotations: Floats) -> Lear
         found.covariance.stretched(used, len(rotations)),
         found.energy,
     )
-
-
-def turned(
-    gram: Floats,
-    found: Learned,
-    *,
-    with_scales: bool,
-    rounds: int,
-    turning: bool = True,
-    should_stop: Callable[[], bool] | None,
-) -> Learned:
-    """Return cameras and covariance after rounds of refinement; with `turning` False the rotations are kept."""
-    for _ in range(rounds):
-        if should_stop is not None and should_stop():
-            break
-        found = turned_once(gram, found, with_scales=with_scales, turning=turning, should_stop=should_stop)
-    return found
-
-
-def turned_once(
-    gram: Floats,
-    found: Learned,
-    *,
-    with_scales: bool,
-    turning: bool = True,
-    factor: Floats | None = None,
-    should_stop: Callable[[], bool] | None = None,
-) -> Learned:
-    """Return cameras and covariance of higher likelihood; `factor` as for `scene_at`, `turning` as for `turned`."""
-    ordered = found.covariance.ordered
-    scene = scene_at(gram, found.rotations, with_scales=with_scales, ordered=ordered, factor=factor)
-    motion = motion_of(scene, found)
-    moved = fit(
-        scene,
-        motion,
-        iterations=ROTATION_ITERATIONS,
-        turning=turning,
-        metric=metric_of(scene, motion),
-        should_stop=should_stop,
-    )
-    return moved_to(scene, found, *moved)

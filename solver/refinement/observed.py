@@ -18,7 +18,7 @@ from pliant.solver.cameras.perspective import Perspective, corrected, depth_map
 from pliant.solver.model.expectation_maximisation import learned
 from pliant.solver.model.observation_model import ImageDensity, inlier_probabilities
 from pliant.solver.records import Floats
-from pliant.solver.refinement.learned import START_EM_ROUNDS, Learned, turned_once
+from pliant.solver.refinement.learned import START_EM_ROUNDS, Learned, Refinement
 from pliant.solver.tracks.completion import often_visible
 from pliant.solver.tracks.normalization import Normalized
 
@@ -133,10 +133,7 @@ def on_observations(
     found: Learned,
     completed: Moments,
     start_scales: Floats,
-    *,
-    with_scales: bool,
-    turning: bool,
-    should_stop: Callable[[], bool] | None = None,
+    how: Refinement,
 ) -> tuple[Learned, Moments]:
     """Return cameras and covariance estimated from the observations, and the expected moments.
 
@@ -150,20 +147,16 @@ def on_observations(
         Moments of the completed tracks.
     start_scales : array, shape (F',)
         Starting scales, to which the cameras are relative.
-    with_scales : bool
-        Whether scales are refined.
-    turning : bool
-        False keeps the rotations.
-    should_stop : callable, optional
-        Called between units of work; once it returns True, the best so far is returned.
+    how : Refinement
+        What is refined.
     """
-    if should_stop is not None and should_stop():
+    if how.stopped():
         return found, completed
     moments = _expected(observed, found, completed, start_scales)
     for _ in range(ROUNDS):
-        if should_stop is not None and should_stop():
+        if how.stopped():
             break
-        found = turned_once(moments.gram, found, with_scales=with_scales, turning=turning, should_stop=should_stop)
+        found = how.refined_once(moments.gram, found)
         moments = _expected(observed, found, moments, start_scales)
     return found, moments
 

@@ -5,16 +5,14 @@ Each start is refined briefly with a shape covariance learned for it; then the l
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import MAX_HYPOTHESIS_GAP, CameraEstimate, restarted
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.records import Floats
 from pliant.solver.refinement.bas_relief import settled_depth
-from pliant.solver.refinement.learned import Learned, learned_at, refined, turned_once
+from pliant.solver.refinement.evidence import Evidence
+from pliant.solver.refinement.learned import Learned, Refinement
 from pliant.solver.tracks.frame_selection import evenly_spread, of_frames
 
 START_FRAMES, COMPARED_EM_ROUNDS, FINALISTS = 40, 45, 3
@@ -42,18 +40,12 @@ class _Trial:
         """Energy of the refined cameras plus the margin."""
         return self.found.energy + self.margin
 
-    def refined(self, gram: Floats, should_stop: Callable[[], bool] | None) -> _Trial:
+    def refined(self, gram: Floats, how: Refinement) -> _Trial:
         """Return the trial after one more refinement."""
-        return replace(self, found=turned_once(gram, self.found, with_scales=False, should_stop=should_stop))
+        return replace(self, found=how.refined_once(gram, self.found))
 
 
-def best_start(
-    estimate: CameraEstimate,
-    gram: Floats,
-    used: NDArray[np.intp],
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None,
-) -> CameraEstimate:
+def best_start(evidence: Evidence, how: Refinement) -> CameraEstimate:
     """Return the estimate with its own rotations or another start's, whichever have the lowest energy after a short refinement.
 
     The multistart models deformation by smooth modes and turns cameras by degrees to fit it. Joint refinement hardly
@@ -61,46 +53,36 @@ def best_start(
     cameras of a factorization, a planar object with other pose signs, or a candidate that the multistart ranks lower. A
     candidate must be better by `MAX_HYPOTHESIS_GAP`: smaller differences do not separate true cameras from false ones.
     """
-    some = evenly_spread(len(used), START_FRAMES)
-    part, ones = of_frames(gram, some), np.ones(len(some))
+    estimate, some = evidence.estimate, evenly_spread(len(evidence.used), START_FRAMES)
+    part, ones = of_frames(evidence.gram, some), np.ones(len(some))
 
     def begun(start: CameraEstimate, margin: float) -> _Trial:
-        given = np.asarray(start.rotations)[used[some]]
-        found = learned_at(part, given, ones, model_order, should_stop, iterations=COMPARED_EM_ROUNDS)
-        return _Trial(start, margin, found).refined(part, should_stop)
+        given = np.asarray(start.rotations)[evidence.used[some]]
+        return _Trial(start, margin, how.learned(part, given, ones, iterations=COMPARED_EM_ROUNDS)).refined(part, how)
 
     own, others = begun(estimate, 0.0), []
     for starts, margin in ((estimate.hypotheses, 0.0), (estimate.candidates, MAX_HYPOTHESIS_GAP)):
         for other in starts:
-            if should_stop is not None and should_stop():
+            if how.stopped():
                 return estimate
             others.append(begun(restarted(estimate, other), margin))
     others.sort(key=lambda trial: trial.energy)
-    finals = [trial.refined(part, should_stop) for trial in (own, *others[:FINALISTS])]
+    finals = [trial.refined(part, how) for trial in (own, *others[:FINALISTS])]
     return min(finals, key=lambda trial: trial.energy).estimate
 
 
-def best_candidate(
-    estimate: CameraEstimate,
-    gram: Floats,
-    used: NDArray[np.intp],
-    found: Learned,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None,
-) -> Learned:
+def best_candidate(evidence: Evidence, found: Learned, how: Refinement) -> Learned:
     """Return the most probable of `found` and all candidates of the multistart, each at its most probable depth.
 
     The camera-motion prior prefers rotations that are too small, whatever their direction. Only at comparable depths can it
     distinguish rotation of the object from deformation.
     """
-    with_scales = bool((found.scales != 1).any())
-    for candidate in estimate.candidates:
-        if should_stop is not None and should_stop():
+    gram = evidence.gram
+    for candidate in evidence.estimate.candidates:
+        if how.stopped():
             break
-        other = refined(
-            gram, candidate.rotations[used], found.scales, with_scales=with_scales, rounds=CANDIDATE_ROUNDS,
-            model_order=model_order, should_stop=should_stop,
-        )  # fmt: skip
+        other = how.learned(gram, candidate.rotations[evidence.used], found.scales)
+        other = how.refined(gram, other, rounds=CANDIDATE_ROUNDS)
         if not np.isfinite(other.energy):
             break
         other, _ = settled_depth(gram, other)

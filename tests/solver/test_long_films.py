@@ -23,6 +23,8 @@ from pliant.solver.evaluation import metrics
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
 from pliant.solver.reconstruction import long_films
+from pliant.solver.records import Floats
+from pliant.solver.refinement.learned import Learned, Refinement
 
 FRAMES, LEARNED = 120, 20
 
@@ -60,6 +62,12 @@ def test_deformation_between_the_learned_frames_is_recovered(film: gallery.Seque
     assert error < 0.5 * interpolated
 
 
+class Unrefined(Refinement):
+    def refined_once(self, gram: Floats, found: Learned, *, factor: Floats | None = None) -> Learned:
+        assert factor is not None or len(gram)
+        return found
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("limited")
 @pytest.mark.long
@@ -68,7 +76,7 @@ def test_resection_recovers_fast_motion_that_interpolation_loses(
 ) -> None:
     solution = solve(film.tracks, film.mesh)
     monkeypatch.setattr(long_films, "resected", lambda views, shapes, poses, **_: poses)
-    monkeypatch.setattr(long_films, "turned_once", lambda gram, found, **_: found)
+    monkeypatch.setattr(long_films, "Refinement", Unrefined)
     interpolated = solve(film.tracks, film.mesh)
     found, lost = (metrics.e3d_frame(each.shapes, film.shapes) for each in (solution, interpolated))
     assert found < 0.1 * lost

@@ -168,7 +168,7 @@ def test_the_corrected_energy_gradient_matches_finite_differences() -> None:
     random = np.random.default_rng(6)
     views = random.normal(size=(6, 30, 2)) + random.normal(size=(6, 1, 2))
     found = Learned(rotations, np.ones(6), replace(covariance, noise_variance=0.5), np.inf)
-    energy = corrected_energy(views, 0.13, found, with_scales=False)
+    energy = corrected_energy(views, 0.13, found)
     flat = np.append(motion_of(energy.scene, found).flat(), 0.15)
     _, gradient = energy(flat)
     for place in (0, 7, 25, len(flat) - 1):

@@ -17,11 +17,10 @@ from pliant.solver.model.full_mode_covariance import (
     refined,
 )
 from pliant.solver.model.marginal_likelihood import Scene, cameras_of
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import angles_between, exponential, nearest
-from pliant.solver.refinement import learned
+from pliant.solver.refinement.learned import Refinement
 
 FRAMES = 16
 
@@ -113,7 +112,8 @@ def test_modes_along_different_axes_determine_the_cameras() -> None:
     gram = tracks @ tracks.T / 600
     wander = 0.05 * np.stack([np.sin(5 * time + 1), np.cos(3 * time), np.sin(2 * time)], axis=1)
     wrong = exponential(wander) @ rotations
-    before = learned.refined(gram, wrong, np.ones(FRAMES), with_scales=False, rounds=2, model_order=ModelOrder())
+    how = Refinement()
+    before = how.refined(gram, how.learned(gram, wrong, np.ones(FRAMES)), rounds=2)
     place = scene(gram, before.rotations, with_scales=False, prior_weight=0.01)
     found, scales = refined(place, np.ones(FRAMES), before.covariance)
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pliant.solver.cameras.perspective import Candidate, Perspective
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.records import Floats
 from pliant.solver.refinement.affine_iterations import affine_iterations
 from pliant.solver.refinement.depth_alternation import aligned
+from pliant.solver.refinement.learned import Refinement
 
 FRAMES, CURVATURE = 24, 0.16
 ANY = (Candidate(0.0, np.inf),)
@@ -45,7 +45,7 @@ def test_cameras_and_sign_of_depth_follow_from_the_tracks(
 ) -> None:
     rotations, view = hinge
     start = cameras_off(rotations, 15.0)
-    found = affine_iterations(view.sample, start, np.ones(FRAMES), replace(view, given=given), model_order=ModelOrder())
+    found = affine_iterations(view.sample, start, np.ones(FRAMES), replace(view, given=given), Refinement())
     assert found is not None
     learned, curvature = found
     assert curvature == given if given is not None else 0.5 < curvature / CURVATURE < 2
@@ -57,7 +57,7 @@ def test_cameras_and_sign_of_depth_follow_from_the_tracks(
 def test_the_result_hardly_depends_on_the_other_cameras(hinge: tuple[Floats, Perspective]) -> None:
     rotations, view = hinge
     one, two = (
-        affine_iterations(view.sample, cameras_off(rotations, degrees), np.ones(FRAMES), view, model_order=ModelOrder())
+        affine_iterations(view.sample, cameras_off(rotations, degrees), np.ones(FRAMES), view, Refinement())
         for degrees in (0.0, 15.0)
     )
     assert one is not None
@@ -71,18 +71,16 @@ def test_the_result_hardly_depends_on_the_other_cameras(hinge: tuple[Floats, Per
 def test_a_more_probable_search_is_kept(hinge: tuple[Floats, Perspective]) -> None:
     rotations, view = hinge
     better = replace(view, curvature=0.1, candidates=(Candidate(0.1, -np.inf),))
-    assert affine_iterations(view.sample, rotations, np.ones(FRAMES), better, model_order=ModelOrder()) is None
+    assert affine_iterations(view.sample, rotations, np.ones(FRAMES), better, Refinement()) is None
 
 
 def test_a_stop_ends_the_iterations(hinge: tuple[Floats, Perspective]) -> None:
     rotations, view = hinge
-    found = affine_iterations(
-        view.sample, rotations, np.ones(FRAMES), view, model_order=ModelOrder(), should_stop=lambda: True
-    )
+    found = affine_iterations(view.sample, rotations, np.ones(FRAMES), view, Refinement(should_stop=lambda: True))
     assert found is None
 
 
 def test_too_few_points_for_any_factorization_have_no_result(hinge: tuple[Floats, Perspective]) -> None:
     rotations, view = hinge
     few = view.sample[:, :5]
-    assert affine_iterations(few, rotations, np.ones(FRAMES), view, model_order=ModelOrder()) is None
+    assert affine_iterations(few, rotations, np.ones(FRAMES), view, Refinement()) is None

@@ -13,6 +13,7 @@ from pliant.solver.model.so3 import MIRROR, angles_between, exponential
 from pliant.solver.refinement import bas_relief, joint_refinement
 from pliant.solver.refinement.bas_relief import LOG_DEPTH_STD, VISIBLE_DEPTH, bulges, extent_penalty, settled_depth
 from pliant.solver.refinement.depth_rounds import with_stretched_depth
+from pliant.solver.refinement.evidence import Evidence
 from pliant.solver.refinement.learned import Learned
 from pliant.solver.tracks.normalization import normalize
 from scipy.optimize import minimize_scalar
@@ -169,10 +170,10 @@ def test_perspective_is_the_same_at_twice_the_depth_and_twice_the_focal_length(m
 
     strong = replace(deep, perspective=replace(deep.perspective, curvature=0.04))
     (given,) = before
-    normalized, scales, used = normalize(tracks), np.ones(12), np.arange(12)
-    plain = with_stretched_depth(strong, normalized, used, given, scales, 1.0)
+    evidence = Evidence.of(strong, normalize(tracks), np.arange(12), np.ones(12))
+    plain = with_stretched_depth(evidence, given, 1.0).estimate
     moved, _ = settled(plain.gram, given)
-    twice = with_stretched_depth(strong, normalized, used, moved, scales, 2.0)
+    twice = with_stretched_depth(evidence, moved, 2.0).estimate
     assert twice.perspective is not None
     assert twice.perspective.curvature == 0.02
     view = deep.perspective.sample

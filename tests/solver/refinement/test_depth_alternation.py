@@ -10,11 +10,10 @@ from pliant.solver import Settings, Tracks, gallery, solve
 from pliant.solver.cameras.perspective import MIRROR, Perspective, centred, columns, depth_map
 from pliant.solver.evaluation.metrics import e3d_frame_scaled
 from pliant.solver.model.expectation_maximisation import annealed
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.refinement import depth_rounds
 from pliant.solver.refinement.depth_alternation import aligned, alternated, factorized_again
-from pliant.solver.refinement.learned import Learned
+from pliant.solver.refinement.learned import Learned, Refinement
 
 PICTURE = (1280.0, 720.0)
 
@@ -54,14 +53,12 @@ def test_a_new_factorization_corrects_cameras_that_are_off(
     given = exponential(off) @ rotations
     start = Learned(given, np.ones(12), annealed(gram, given[:, :2], iterations=30), np.inf)
     used = np.arange(12)
-    found, moved = alternated(view, start, used, model_order=ModelOrder(), turning=True)
+    found, moved = alternated(view, start, used, Refinement())
     moved = replace(moved, depth=depth_map(found.rotations, found.scales, found.covariance))
-    better = factorized_again(found.scales, moved, found, used, model_order=ModelOrder())
+    better = factorized_again(found.scales, moved, found, used, Refinement())
     turned = found.rotations if better is None else better
     assert np.degrees(angles_between(aligned(turned, rotations, used), rotations)).max() < 0.5
-    assert (
-        factorized_again(found.scales, moved, found, used, model_order=ModelOrder(), should_stop=lambda: True) is None
-    )
+    assert factorized_again(found.scales, moved, found, used, Refinement(should_stop=lambda: True)) is None
 
 
 def test_a_round_that_leads_to_extreme_depths_is_discarded(
@@ -70,7 +67,7 @@ def test_a_round_that_leads_to_extreme_depths_is_discarded(
     rotations, view, gram = rigid
     covariance = annealed(gram, rotations[:, :2], iterations=5)
     given = Learned(rotations, np.ones(12), replace(covariance, mean_covariance=1e19 * np.eye(3)), np.inf)
-    found, moved = alternated(view, given, np.arange(12), model_order=ModelOrder(), turning=True)
+    found, moved = alternated(view, given, np.arange(12), Refinement())
     assert found is given
     assert moved is view
 

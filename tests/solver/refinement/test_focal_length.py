@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.so3 import angles_between, exponential, logarithm, nearest
 from pliant.solver.records import Floats
 from pliant.solver.refinement.focal_length import _Comparison, search
-from pliant.solver.refinement.learned import Learned, stretched
+from pliant.solver.refinement.learned import Learned, Refinement, stretched
 from pliant.solver.tracks.frame_selection import evenly_spread
 
 CURVATURE = 0.18
@@ -49,9 +49,7 @@ def view_of(frames: int) -> Perspective:
 
 def test_noise_and_cameras_that_turn_too_little_do_not_hide_perspective() -> None:
     face = seen_face(32, 300, noise=0.01)
-    view, found = search(
-        face.views, face.start, np.ones(32), view_of(32), model_order=ModelOrder(noisy_start=True), turning=True
-    )
+    view, found = search(face.views, face.start, np.ones(32), view_of(32), Refinement(ModelOrder(noisy_start=True)))
     assert view.curvature == pytest.approx(CURVATURE, rel=0.1)
     assert view.settled
     assert face.off(found.rotations) < 0.5 * face.off(face.start)
@@ -63,28 +61,28 @@ def test_noise_and_cameras_that_turn_too_little_do_not_hide_perspective() -> Non
 
 def test_given_rotations_are_kept() -> None:
     face = seen_face(8, 40, noise=0.0)
-    view, found = search(face.views, face.rotations, np.ones(8), view_of(8), model_order=ModelOrder(), turning=False)
+    view, found = search(face.views, face.rotations, np.ones(8), view_of(8), Refinement(turning=False))
     assert view.curvature > 0
     assert found.rotations == pytest.approx(face.rotations, abs=1e-12)
 
 
 def test_levelling_only_raises_likelihoods_and_reaches_orthography() -> None:
     face = seen_face(8, 40, noise=0.01)
-    comparison = _Comparison.of(face.views, face.start, np.ones(8), ModelOrder(), turning=True)
+    comparison = _Comparison.of(face.views, face.start, np.ones(8), Refinement())
     comparison.add(0.1)
     comparison.add(-0.1)
     before = {curvature: trial.nll for curvature, trial in comparison.trials.items()}
-    comparison.level(bool)
+    comparison.level()
     after = {curvature: trial.nll for curvature, trial in comparison.trials.items()}
     assert all(after[curvature] <= before[curvature] for curvature in before)
     assert after[0.0] < before[0.0]
-    comparison.level(lambda: True)
+    replace(comparison, how=Refinement(should_stop=lambda: True)).level()
     assert {curvature: trial.nll for curvature, trial in comparison.trials.items()} == after
 
 
 def test_a_focal_length_at_which_the_depths_diverge_is_unlikely() -> None:
     face = seen_face(8, 40, noise=0.0)
-    comparison = _Comparison.of(face.views, face.rotations, np.ones(8), ModelOrder(), turning=True)
+    comparison = _Comparison.of(face.views, face.rotations, np.ones(8), Refinement())
     comparison.add(30.0)
     assert comparison.trials[30.0].nll == UNLIKELY
 
@@ -92,7 +90,7 @@ def test_a_focal_length_at_which_the_depths_diverge_is_unlikely() -> None:
 def test_cameras_of_some_frames_are_extended_to_all() -> None:
     face = seen_face(9, 40, noise=0.0)
     used = evenly_spread(9, 5)
-    comparison = _Comparison.of(face.views[used], face.start[used], np.ones(5), ModelOrder(), turning=True)
+    comparison = _Comparison.of(face.views[used], face.start[used], np.ones(5), Refinement())
     found = comparison.trials[0.0].found
     every = stretched(found, used, face.start)
     assert every.rotations[used] == pytest.approx(found.rotations, abs=1e-9)

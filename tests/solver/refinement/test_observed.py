@@ -10,11 +10,10 @@ from pliant.solver import KnownCamera, Settings, Tracks, estimate_cameras, galle
 from pliant.solver.cameras.estimation import given_cameras
 from pliant.solver.cameras.perspective import Perspective, corrected
 from pliant.solver.model.expectation_maximisation import MAX_MODES
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.reconstruction import cameras as reconstruction
 from pliant.solver.records import Floats
 from pliant.solver.refinement.joint_refinement import refine_cameras
-from pliant.solver.refinement.learned import learned_at
+from pliant.solver.refinement.learned import Refinement
 from pliant.solver.refinement.observed import Moments, Observed, cross_fitted, on_observations
 from pliant.solver.tracks.normalization import normalize
 
@@ -22,6 +21,7 @@ MADE = gallery.face(20, 60, degrees=60)
 KNOWN = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
 USED = np.arange(20)
 ONES = np.ones(20)
+KEPT = Refinement(turning=False)
 
 
 def begun(tracks: Tracks) -> tuple[Observed, object, Moments]:
@@ -58,8 +58,8 @@ def test_a_point_is_judged_by_a_covariance_of_the_others() -> None:
 def test_expected_moments_are_nearer_to_the_truth_than_completed_tracks(outliers: float) -> None:
     tracks = gallery.corrupt(MADE, noise=0.005, hidden=0.4, outliers=outliers, seed=3).tracks
     observed, _, completed = begun(tracks)
-    start = learned_at(completed.gram, np.asarray(KNOWN.rotations), ONES, ModelOrder(), None)
-    found, moments = on_observations(observed, start, completed, ONES, with_scales=False, turning=False)
+    start = KEPT.learned(completed.gram, np.asarray(KNOWN.rotations), ONES)
+    found, moments = on_observations(observed, start, completed, ONES, KEPT)
     np.testing.assert_array_equal(found.rotations, KNOWN.rotations)
     true = true_sample(normalize(tracks).unit)
     hidden = observed.confidence == 0
@@ -75,17 +75,17 @@ def test_perspective_is_corrected_with_the_depths_of_the_expected_tracks() -> No
     """Tracks of a pinhole give the moments that the same tracks give under orthography."""
     tracks = gallery.corrupt(MADE, hidden=0.2, seed=2).tracks
     observed, _, completed = begun(tracks)
-    start = learned_at(completed.gram, np.asarray(KNOWN.rotations), ONES, ModelOrder(), None)
-    _, flat = on_observations(observed, start, completed, ONES, with_scales=False, turning=False)
+    start = KEPT.learned(completed.gram, np.asarray(KNOWN.rotations), ONES)
+    _, flat = on_observations(observed, start, completed, ONES, KEPT)
     unit, curvature = normalize(tracks).unit, 0.1
     depths = np.einsum("fj,fpj->fp", MADE.rotations[:, 2], MADE.shapes) / unit
     depths -= depths.mean(axis=1, keepdims=True)
     bent = np.asarray(corrected(observed.points, np.zeros_like(depths), 0.0)) / (1 + curvature * depths)[..., None]
     view = Perspective(np.zeros((20, 2)), np.zeros(2), curvature=curvature)
     pinhole = replace(observed, points=bent, view=view)
-    _, moments = on_observations(pinhole, start, completed, ONES, with_scales=False, turning=False)
+    _, moments = on_observations(pinhole, start, completed, ONES, KEPT)
     uncorrected = replace(pinhole, view=None)
-    _, wrong = on_observations(uncorrected, start, completed, ONES, with_scales=False, turning=False)
+    _, wrong = on_observations(uncorrected, start, completed, ONES, KEPT)
     error, least = (np.linalg.norm(each.sample - flat.sample) for each in (wrong, moments))
     assert least < 0.25 * error
 
@@ -93,10 +93,8 @@ def test_perspective_is_corrected_with_the_depths_of_the_expected_tracks() -> No
 def test_a_stop_leaves_the_cameras() -> None:
     tracks = gallery.corrupt(MADE, hidden=0.2, seed=2).tracks
     observed, _, completed = begun(tracks)
-    start = learned_at(completed.gram, np.asarray(KNOWN.rotations), ONES, ModelOrder(), None)
-    found, moments = on_observations(
-        observed, start, completed, ONES, with_scales=False, turning=True, should_stop=lambda: True
-    )
+    start = KEPT.learned(completed.gram, np.asarray(KNOWN.rotations), ONES)
+    found, moments = on_observations(observed, start, completed, ONES, Refinement(should_stop=lambda: True))
     assert found is start
     assert np.isfinite(moments.gram).all()
 
