@@ -190,7 +190,7 @@ def _factorized(
     return factorized, entries
 
 
-def restarted(estimate: CameraEstimate, other: OtherCameras) -> CameraEstimate:
+def with_other_cameras(estimate: CameraEstimate, other: OtherCameras) -> CameraEstimate:
     """Return the estimate with other rotations."""
     known = estimate.reasons.get("basis_size", "")
     why = f"{known} With the shapes, {other.description} lead to more probable motion."

@@ -98,7 +98,7 @@ class Perspective:
     flipped: int = 1
     """−1 if all depths, and the sign of `curvature`, were reversed after the comparison."""
 
-    settled: bool = False
+    sign_known: bool = False
     """Whether the sign of depth is known."""
 
     candidates: tuple[Candidate, ...] = ()
@@ -107,11 +107,11 @@ class Perspective:
     filling: Filling | None = None
     """How hidden entries are completed; None if there are none."""
 
-    sample: Floats = field(default_factory=lambda: np.zeros((0, 0, 2)))
+    visible_sample: Floats = field(default_factory=lambda: np.zeros((0, 0, 2)))
     """Complete tracks, uncorrected, of the sampled points that are often visible, relative to the principal point, shape `(F, S', 2)`,
     normalized units."""
 
-    whole: Floats = field(default_factory=lambda: np.zeros((0, 0, 2)))
+    full_sample: Floats = field(default_factory=lambda: np.zeros((0, 0, 2)))
     """The same of all sampled points, shape `(F, S, 2)`."""
 
     depth: Floats | DepthMap = field(default_factory=lambda: np.zeros((0, 0)))
@@ -188,7 +188,7 @@ def mean_depth(view: Perspective) -> Floats:
     Scales and κ are learned from the sample. With the mean of all points as origin, which differs in depth, the errors at 3, 5 and 10
     half-sizes are 1.06 to 1.18 times as large for face scans and a speaking head, .99 times for a horse (1,000 points).
     """
-    images = _corrected_by(view, view.sample)
+    images = _corrected_by(view, view.visible_sample)
     return np.asarray(view.depth @ columns(images.mean(axis=1, keepdims=True)))
 
 
@@ -240,7 +240,7 @@ def corrected_moments(view: Perspective, normalized: Normalized) -> tuple[Floats
         used += points.shape[1]
     mean = total / used
     flat = mean.reshape(-1)
-    return gram / used - np.outer(flat, flat), mean, centred(_corrected_by(view, view.whole, origin))
+    return gram / used - np.outer(flat, flat), mean, centred(_corrected_by(view, view.full_sample, origin))
 
 
 def _corrected_by(view: Perspective, views: Floats, origin: Floats | None = None) -> Floats:

@@ -48,7 +48,7 @@ def with_camera_choice(
     return replace(
         choices,
         camera="perspective" if view.bends else plain,
-        depth_sign="settled" if given or (view.bends and view.settled) else "ambiguous",
+        depth_sign="settled" if given or (view.bends and view.sign_known) else "ambiguous",
         focal_candidates=candidates,
         reasons={**choices.reasons, "camera_model": described(view, unit)},
         warnings=(*choices.warnings, *(each for each in warnings if each is not None)),

@@ -18,7 +18,7 @@ from pliant.solver.reconstruction.long_films import extended
 from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, monitored, observe
 from pliant.solver.records import MIN_POINTS, Camera, Floats, KnownCamera, Step, Tracks, read_only
 from pliant.solver.refinement.covariance_learning import LearningData, learn_covariance
-from pliant.solver.refinement.depth_rounds import settled
+from pliant.solver.refinement.depth_rounds import correct_perspective
 from pliant.solver.refinement.evidence import Evidence
 from pliant.solver.refinement.joint_refinement import refine_cameras
 from pliant.solver.refinement.learned import Refinement
@@ -183,7 +183,9 @@ def _with_shapes(
         used = np.flatnonzero(shown)
         some = used[evenly_spread(len(used), LEARNED_FRAMES)]
         how = Refinement(ModelOrder(ordered=estimate.ordered), turning=observations.turning, should_stop=monitor)
-        estimate = settled(Evidence.of(estimate, normalized, some, np.asarray(estimate.scales)), how).estimate
+        estimate = correct_perspective(
+            Evidence.of(estimate, normalized, some, np.asarray(estimate.scales)), how
+        ).estimate
     return estimate, data
 
 

@@ -72,7 +72,7 @@ def extended(
         sample = _completed(views, shapes, poses)
         start = Learned(poses.rotations, poses.scales, replace(covariance, modes=poses.coefficients), np.inf)
         how = Refinement(with_scales=with_scales, should_stop=should_stop)
-        moved = how.refined_once(np.zeros((0, 0)), start, factor=columns(sample) / sample.shape[1] ** 0.5)
+        moved = how.refine_once(np.zeros((0, 0)), start, factor=columns(sample) / sample.shape[1] ** 0.5)
         poses = replace(poses, rotations=moved.rotations, scales=moved.scales * np.exp(np.log(poses.scales).mean()))
         poses = resected(views, shapes, poses, turning=False, with_scales=False, should_stop=should_stop)
     return _whole(estimate, covariance, observations, views, shapes, poses, begun)
@@ -193,6 +193,6 @@ def _perspective(
         return view
     view = replace(view, offsets=lens.offsets, filling=filling)
     if not view.bends:
-        return replace(view, sample=np.zeros((0, 0, 2)))
+        return replace(view, visible_sample=np.zeros((0, 0, 2)))
     seen = _filled(views, shapes, poses, as_seen=True)
-    return replace(view, sample=seen, depth=depth_map(rotations, scales, covariance))
+    return replace(view, visible_sample=seen, depth=depth_map(rotations, scales, covariance))

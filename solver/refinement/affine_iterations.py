@@ -20,7 +20,7 @@ from pliant.solver.refinement.focal_length import (
     SEARCH_EM_ROUNDS,
     SEARCH_ITERATIONS,
     compared_frames,
-    refined_with_focal,
+    refine_with_focal,
 )
 from pliant.solver.refinement.learned import Learned, Refinement
 
@@ -128,7 +128,7 @@ class _Iterations:
 
     def _rated(self, size: int, curvature: float, found: Learned) -> _Trial:
         try:
-            refined, _ = refined_with_focal(
+            refined, _ = refine_with_focal(
                 self.views, found, curvature, free=False, turning=True, iterations=SEARCH_ITERATIONS
             )
         except np.linalg.LinAlgError:  # the depths diverge
@@ -139,4 +139,4 @@ class _Iterations:
         rows = columns(centred(images)) / np.repeat(self.scales, 2)[:, None]
         rotations = upgrade(rows @ rows.T / rows.shape[1], size).rotations
         turned = aligned(rotations, like, np.arange(len(images)))
-        return self.how.annealed(images, turned, self.scales, iterations=SEARCH_EM_ROUNDS)
+        return self.how.anneal(images, turned, self.scales, iterations=SEARCH_EM_ROUNDS)

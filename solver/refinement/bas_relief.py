@@ -46,7 +46,7 @@ MAX_ANGLE = np.radians(60.0)
 """Angle from d, rad, that no frame may exceed after the step: bas-relief is an approximation for small angles."""
 
 
-def settled_depth(gram: Floats, found: Learned) -> tuple[Learned, float]:
+def at_probable_depth(gram: Floats, found: Learned) -> tuple[Learned, float]:
     """Return cameras and covariance at the most probable λ, and λ.
 
     Parameters

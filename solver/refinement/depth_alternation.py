@@ -17,7 +17,7 @@ from pliant.solver.cameras.multistart import CANDIDATES
 from pliant.solver.cameras.perspective import Perspective, centred, columns, corrected, depths_of
 from pliant.solver.model.so3 import MIRROR, nearest
 from pliant.solver.records import Floats
-from pliant.solver.refinement.focal_length import refined_with_focal
+from pliant.solver.refinement.focal_length import refine_with_focal
 from pliant.solver.refinement.learned import Learned, Refinement
 from pliant.solver.tracks.frame_selection import evenly_spread
 
@@ -31,7 +31,7 @@ COMPARED_FRAMES = 40
 """Frames on which the cameras of factorizations are compared, as in `starts.START_FRAMES`."""
 
 
-def alternated(
+def alternate(
     view: Perspective,
     found: Learned,
     used: NDArray[np.intp],
@@ -54,7 +54,7 @@ def alternated(
     rounds : int
         Maximum number of rounds.
     """
-    views = view.sample[used]
+    views = view.visible_sample[used]
     for _ in range(rounds):
         if how.stopped():
             break
@@ -62,14 +62,12 @@ def alternated(
             found = _relearned(views, view.curvature, found, how)
         except np.linalg.LinAlgError:
             break
-        found, curvature = refined_with_focal(
-            views, found, view.curvature, free=view.given is None, turning=how.turning
-        )
+        found, curvature = refine_with_focal(views, found, view.curvature, free=view.given is None, turning=how.turning)
         view = replace(view, curvature=curvature)
     return found, view
 
 
-def factorized_again(
+def refactorize(
     scales: Floats,
     view: Perspective,
     found: Learned,
@@ -99,13 +97,13 @@ def factorized_again(
     )  # fmt: skip
 
     def energy(start: Learned) -> float:
-        moved, _ = alternated(view, start, some, replace(how, should_stop=None), rounds=1)
+        moved, _ = alternate(view, start, some, replace(how, should_stop=None), rounds=1)
         return moved.energy
 
-    turns = towards(view.sample.mean(axis=1), view.curvature)
+    turns = towards(view.visible_sample.mean(axis=1), view.curvature)
     rows = columns(_turned(view, turns) / scales[:, None, None])
     gram = rows @ rows.T / rows.shape[1]
-    limit = min(len(gram) // 3, view.sample.shape[1] // 3)
+    limit = min(len(gram) // 3, view.visible_sample.shape[1] // 3)
     best, lowest = None, energy(part)
     for each in upgrades(gram, [size for size in CANDIDATES if size <= limit]):
         if how.stopped():
@@ -119,8 +117,8 @@ def factorized_again(
 
 def _turned(view: Perspective, turns: Floats) -> Floats:
     """Return the corrected and centred tracks of the sample, `(F, S, 2)`, seen by turned cameras."""
-    depths = depths_of(view.depth, view.sample, view.curvature)
-    images = centred(corrected(view.sample, depths, view.curvature))
+    depths = depths_of(view.depth, view.visible_sample, view.curvature)
+    images = centred(corrected(view.visible_sample, depths, view.curvature))
     depths -= depths.mean(axis=1, keepdims=True)
     return np.asarray(images @ turns[:, :2, :2].transpose(0, 2, 1) + depths[..., None] * turns[:, None, :2, 2])
 
@@ -140,5 +138,5 @@ def _relearned(views: Floats, curvature: float, found: Learned, how: Refinement)
     rotations = aimed.turned(found.rotations)
     depths = depths_of(aimed.depth_map(rotations, found.scales, found.covariance), aimed.views, curvature)
     flat = corrected(aimed.views, depths, curvature)
-    again = how.annealed(flat, rotations, found.scales, iterations=ALTERNATION_EM_ROUNDS)
+    again = how.anneal(flat, rotations, found.scales, iterations=ALTERNATION_EM_ROUNDS)
     return replace(found, covariance=again.covariance)

@@ -13,10 +13,10 @@ from pliant.solver.model.so3 import MIRROR
 from pliant.solver.records import Floats, read_only
 from pliant.solver.refinement.affine_iterations import affine_iterations
 from pliant.solver.refinement.bas_relief import LOG_DEPTH_STD
-from pliant.solver.refinement.depth_alternation import alternated, factorized_again
+from pliant.solver.refinement.depth_alternation import alternate, refactorize
 from pliant.solver.refinement.evidence import Evidence
 from pliant.solver.refinement.focal_length import search
-from pliant.solver.refinement.learned import Learned, Refinement, stretched
+from pliant.solver.refinement.learned import Learned, Refinement, to_all_frames
 from pliant.solver.tracks.completion import briefly_hidden
 
 RESTARTS = 3
@@ -27,7 +27,7 @@ MIN_GAIN = 0.01
 from different starts differ by as much."""
 
 
-def settled(evidence: Evidence, how: Refinement) -> Evidence:
+def correct_perspective(evidence: Evidence, how: Refinement) -> Evidence:
     """Return the evidence with κ determined and the tracks corrected; if κ is 0, only `perspective` is updated.
 
     Parameters
@@ -39,26 +39,28 @@ def settled(evidence: Evidence, how: Refinement) -> Evidence:
     """
     estimate, used = evidence.estimate, evidence.used
     assert estimate.perspective is not None
-    whole = estimate.sample + (estimate.perspective.offsets + estimate.translations)[:, None]
+    sample = estimate.sample + (estimate.perspective.offsets + estimate.translations)[:, None]
     briefly = briefly_hidden(evidence.normalized.visible)[estimate.sampled]
-    view = replace(estimate.perspective, filling=estimate.filling, sample=whole[:, briefly], whole=whole)
-    cameras = view.sample[used], evidence.rotations, evidence.start_scales[used]
+    view = replace(
+        estimate.perspective, filling=estimate.filling, visible_sample=sample[:, briefly], full_sample=sample
+    )
+    cameras = view.visible_sample[used], evidence.rotations, evidence.start_scales[used]
     view, found = search(*cameras, view, how)
     if not view.bends:
         return replace(evidence, estimate=replace(estimate, perspective=view))
-    reached, best = _converged(evidence, found, view, how)
+    reached, best = _correct_from(evidence, found, view, how)
     if not how.turning or is_planar(reached.estimate.gram):
         return reached
-    reached, best = _restarted(reached, best, how)
+    reached, best = _restart(reached, best, how)
     start = affine_iterations(*cameras, view, how)
     if start is None:
         return reached
     found, curvature = start
-    other, found = _restarted(*_converged(evidence, found, replace(view, curvature=curvature), how), how)
+    other, found = _restart(*_correct_from(evidence, found, replace(view, curvature=curvature), how), how)
     return other if found.energy < best.energy - MIN_GAIN else reached
 
 
-def _converged(evidence: Evidence, found: Learned, view: Perspective, how: Refinement) -> tuple[Evidence, Learned]:
+def _correct_from(evidence: Evidence, found: Learned, view: Perspective, how: Refinement) -> tuple[Evidence, Learned]:
     """Return the evidence with the tracks corrected after alternation from `found` and κ, with κ positive where z points away."""
     if view.curvature * view.signs[0] < 0:
         view = replace(view, curvature=-view.curvature, flipped=-1)
@@ -67,11 +69,11 @@ def _converged(evidence: Evidence, found: Learned, view: Perspective, how: Refin
         estimate = evidence.estimate
         estimate = replace(estimate, rotations=MIRROR @ np.asarray(estimate.rotations) @ MIRROR)
         evidence = replace(evidence, estimate=estimate)
-    found, view = alternated(view, found, evidence.used, how)
-    return _applied(evidence, found, view), found
+    found, view = alternate(view, found, evidence.used, how)
+    return _with_corrected_tracks(evidence, found, view), found
 
 
-def _restarted(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evidence, Learned]:
+def _restart(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evidence, Learned]:
     """Return the evidence after alternations from cameras of the corrected tracks, repeated while the likelihood rises.
 
     `found` holds the estimate's cameras and covariance at the frames used, and is returned refined.
@@ -80,27 +82,27 @@ def _restarted(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evi
     for _ in range(RESTARTS):
         view = evidence.estimate.perspective
         assert view is not None
-        rotations = factorized_again(scales, view, found, used, how)
+        rotations = refactorize(scales, view, found, used, how)
         if rotations is None:
             break
-        other, moved = alternated(view, replace(found, rotations=rotations[used]), used, how)
+        other, moved = alternate(view, replace(found, rotations=rotations[used]), used, how)
         gain = found.energy - other.energy
         if gain <= 0:
             break
         evidence = replace(evidence, estimate=replace(evidence.estimate, rotations=rotations))
-        evidence, found = _applied(evidence, other, moved), other
+        evidence, found = _with_corrected_tracks(evidence, other, moved), other
         if gain < MIN_GAIN:
             break
     return evidence, found
 
 
-def settled_again(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evidence, Learned]:
+def update_correction(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evidence, Learned]:
     """Return the evidence with tracks corrected for refined cameras and covariance `found`, and these refined once more."""
     view, scales = evidence.estimate.perspective, evidence.start_scales[evidence.used]
     assert view is not None
-    whole = replace(found, scales=found.scales * scales)
-    whole, view = alternated(view, whole, evidence.used, how)
-    return _applied(evidence, whole, view), replace(whole, scales=whole.scales / scales)
+    absolute = replace(found, scales=found.scales * scales)
+    absolute, view = alternate(view, absolute, evidence.used, how)
+    return _with_corrected_tracks(evidence, absolute, view), replace(absolute, scales=absolute.scales / scales)
 
 
 def with_stretched_depth(evidence: Evidence, found: Learned, stretch: float) -> Evidence:
@@ -112,7 +114,9 @@ def with_stretched_depth(evidence: Evidence, found: Learned, stretch: float) -> 
     assert view is not None
     curvature, std = view.curvature / stretch, (view.curvature_std or 0.0) / stretch
     view = replace(view, curvature=curvature, curvature_std=float(np.hypot(std, LOG_DEPTH_STD * curvature)))
-    return _applied(evidence, replace(found, scales=found.scales * evidence.start_scales[evidence.used]), view)
+    return _with_corrected_tracks(
+        evidence, replace(found, scales=found.scales * evidence.start_scales[evidence.used]), view
+    )
 
 
 def with_depth_map(
@@ -126,14 +130,13 @@ def with_depth_map(
     return replace(estimate, perspective=replace(view, depth=depth))
 
 
-def _applied(evidence: Evidence, found: Learned, view: Perspective) -> Evidence:
+def _with_corrected_tracks(evidence: Evidence, found: Learned, view: Perspective) -> Evidence:
     """Return the evidence with the rotations found and the tracks corrected with the depths found; `found` has absolute scales."""
-    every = stretched(found, evidence.used, np.asarray(evidence.estimate.rotations))
+    every = to_all_frames(found, evidence.used, np.asarray(evidence.estimate.rotations))
     view = replace(view, depth=depth_map(every.rotations, every.scales, every.covariance))
     gram, translations, sample = corrected_moments(view, evidence.normalized)
     read_only(every.rotations)
-    return evidence.corrected(
-        replace(
-            evidence.estimate, rotations=every.rotations, gram=gram, translations=translations, sample=sample, perspective=view
-        )
+    estimate = replace(
+        evidence.estimate, rotations=every.rotations, gram=gram, translations=translations, sample=sample, perspective=view
     )  # fmt: skip
+    return evidence.corrected(estimate)

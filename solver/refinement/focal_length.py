@@ -37,7 +37,7 @@ from pliant.solver.model.image_density import factor_of
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, UNLIKELY, Motion, energy_with_inverse
 from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.records import Floats
-from pliant.solver.refinement.learned import Learned, Refinement, motion_of, moved_to, scene_at, stretched
+from pliant.solver.refinement.learned import Learned, Refinement, motion_of, moved_to, scene_at, to_all_frames
 from pliant.solver.tracks.frame_selection import evenly_spread
 from scipy.optimize import minimize
 
@@ -123,7 +123,7 @@ def search(
         comparison.level()
     view = _decided(view, comparison.trials, len(used), views.shape[1])
     found = comparison.trials[view.curvature if view.curvature in comparison.trials else 0.0].found
-    return view, stretched(found, used, rotations)
+    return view, to_all_frames(found, used, rotations)
 
 
 def compared_frames(views: Floats) -> NDArray[np.intp]:
@@ -143,7 +143,7 @@ class _Comparison:
     def of(cls, views: Floats, rotations: Floats, scales: Floats, how: Refinement) -> _Comparison:
         """Learn the covariance for κ = 0 from scratch."""
         comparison = cls(views, how, {})
-        flat = _Trial(0.0, np.inf, how.annealed(views, rotations, scales, iterations=SEARCH_EM_ROUNDS))
+        flat = _Trial(0.0, np.inf, how.anneal(views, rotations, scales, iterations=SEARCH_EM_ROUNDS))
         comparison.trials[0.0] = comparison._continued(flat, 0.0)
         return comparison
 
@@ -173,7 +173,7 @@ class _Comparison:
             turns = towards(middle, curvature).transpose(0, 2, 1) @ towards(middle, trial.curvature)
             found = replace(found, rotations=turns @ found.rotations)
         try:
-            found, _ = refined_with_focal(
+            found, _ = refine_with_focal(
                 self.views, found, curvature, free=False, turning=self.how.turning, iterations=SEARCH_ITERATIONS
             )
         except np.linalg.LinAlgError:  # the depths diverge
@@ -261,15 +261,15 @@ def _decided(view: Perspective, trials: dict[float, _Trial], frames: int, points
         return replace(view, curvature=best, candidates=candidates)
     nll = trials[best].nll
     opposite = min((each.nll for each in candidates if each.curvature * best < 0), default=np.inf)
-    settled = len(view.signs) == 1 or bool(np.isfinite(opposite) and opposite - nll > MIN_PERSPECTIVE_GAIN)
-    needed = trials[0.0].nll - nll > max(MIN_PERSPECTIVE_GAIN, MIN_TOTAL_GAIN / (frames * points)) and settled
+    sign_known = len(view.signs) == 1 or bool(np.isfinite(opposite) and opposite - nll > MIN_PERSPECTIVE_GAIN)
+    needed = trials[0.0].nll - nll > max(MIN_PERSPECTIVE_GAIN, MIN_TOTAL_GAIN / (frames * points)) and sign_known
     if not (needed or view.required or view.given is not None):
         return replace(view, curvature=0.0, candidates=candidates)
     std, found = None, _around(trials)
     if view.given is None and found is not None:
         bend = max(_parabola(*found)[1], 1e-12)
         std = float(1 / np.sqrt(bend * frames * min(points, 1 / CAMERA_PRIOR_WEIGHT)))
-    return replace(view, curvature=best, curvature_std=std, candidates=candidates, settled=settled)
+    return replace(view, curvature=best, curvature_std=std, candidates=candidates, sign_known=sign_known)
 
 
 def more_probable(view: Perspective) -> tuple[float, float] | None:
@@ -302,7 +302,7 @@ def unclear_perspective(view: Perspective) -> tuple[float, float] | None:
     return (best, gain) if UNCLEAR_GAINS[0] < gain < UNCLEAR_GAINS[1] else None
 
 
-def refined_with_focal(
+def refine_with_focal(
     views: Floats,
     found: Learned,
     curvature: float,
@@ -330,7 +330,7 @@ def refined_with_focal(
     """
     turns = towards(views.mean(axis=1), curvature)
     start = replace(found, rotations=turns @ found.rotations) if turning else found
-    energy = corrected_energy(views, curvature, start, turning=turning)
+    energy = CorrectedEnergy(views, curvature, start, turning=turning)
     motion = motion_of(energy.scene, start)
     held = 0 if turning else 3 * len(views)
     given = np.append(motion.flat(), curvature)
@@ -350,7 +350,7 @@ def refined_with_focal(
     return replace(moved, rotations=rotations), float(flat[-1])
 
 
-class corrected_energy:  # noqa: N801
+class CorrectedEnergy:
     """E of tracks corrected with fixed depths, as a function of the likelihood's parameters, followed by κ.
 
     The tracks are linear in the change of κ. With `turning`, they are turned towards the object (`cameras.aimed`), as are the cameras of

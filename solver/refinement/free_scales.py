@@ -62,10 +62,10 @@ def try_free_scales(gram: Floats, rotations: Floats, how: Refinement) -> ScaleTr
     starts = [none, rigid_scales(part, given)]
     if not how.turning:
         starts.append(_smooth_scales(part, given, how))
-    even, *others = (how.learned(part, given, scales) for scales in starts)
-    fixed = replace(how, with_scales=False).refined(part, even, rounds=SCALE_ROUNDS)
+    even, *others = (how.learn(part, given, scales) for scales in starts)
+    fixed = replace(how, with_scales=False).refine(part, even, rounds=SCALE_ROUNDS)
     free = replace(how, with_scales=True)
-    runs = [free.refined(part, each, rounds=SCALE_ROUNDS) for each in (even, *others)]
+    runs = [free.refine(part, each, rounds=SCALE_ROUNDS) for each in (even, *others)]
     best = min(runs, key=lambda run: run.energy)
     gain, logs = fixed.energy - best.energy, np.log(best.scales)
     extent = f"from {best.scales.min():.3f} to {best.scales.max():.3f}"

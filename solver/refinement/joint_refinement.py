@@ -21,9 +21,9 @@ from pliant.solver.model.resection import rotations_between
 from pliant.solver.model.so3 import MIRROR, angles_between
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only
-from pliant.solver.refinement.bas_relief import bulges, is_typical, settled_depth
+from pliant.solver.refinement.bas_relief import at_probable_depth, bulges, is_typical
 from pliant.solver.refinement.covariance_learning import LearningData
-from pliant.solver.refinement.depth_rounds import settled, settled_again, with_stretched_depth
+from pliant.solver.refinement.depth_rounds import correct_perspective, update_correction, with_stretched_depth
 from pliant.solver.refinement.evidence import Evidence
 from pliant.solver.refinement.free_scales import SCALE_ROUNDS, ScaleTrial, try_free_scales
 from pliant.solver.refinement.learned import Learned, Refinement, scene_at
@@ -82,7 +82,7 @@ def refine_cameras(
     estimates_scales = estimates_scales and bool((evidence.start_scales == 1).all())
     if not turning:
         return _with_kept_rotations(evidence, how, estimates_scales=estimates_scales)
-    start, trial = _started(evidence, how), None
+    start, trial = _choose_start(evidence, how), None
     if estimates_scales:
         enter(should_stop, "scales")
         trial = try_free_scales(start.gram, start.rotations, how)
@@ -107,11 +107,11 @@ def _with_kept_rotations(
     uncorrected: Evidence, how: Refinement, *, estimates_scales: bool
 ) -> tuple[CameraEstimate, LearningData]:
     """Return what `refine_cameras` does if the rotations are kept."""
-    evidence = _started(uncorrected, how)
+    evidence = _choose_start(uncorrected, how)
     if estimates_scales:
         evidence = _with_free_scales(evidence, uncorrected, how)
     if evidence.estimate.filling is not None:
-        found = how.learned(evidence.gram, evidence.rotations, np.ones(len(evidence.used)))
+        found = how.learn(evidence.gram, evidence.rotations, np.ones(len(evidence.used)))
         evidence, _ = _of_observations(evidence, found, how)
     estimate = evidence.estimate
     return estimate, LearningData(
@@ -120,7 +120,7 @@ def _with_kept_rotations(
     )  # fmt: skip
 
 
-def _started(start: Evidence, how: Refinement) -> Evidence:
+def _choose_start(start: Evidence, how: Refinement) -> Evidence:
     """Return the most probable start, with tracks corrected for perspective if needed."""
     should_stop = how.should_stop
     if how.turning and (others := len(start.estimate.hypotheses) + len(start.estimate.candidates)):
@@ -129,7 +129,7 @@ def _started(start: Evidence, how: Refinement) -> Evidence:
     if start.estimate.perspective is None:
         return start
     enter(should_stop, "perspective")
-    return settled(start, how)
+    return correct_perspective(start, how)
 
 
 def _with_free_scales(corrected: Evidence, uncorrected: Evidence, how: Refinement) -> Evidence:
@@ -144,7 +144,7 @@ def _with_free_scales(corrected: Evidence, uncorrected: Evidence, how: Refinemen
         return replace(corrected, estimate=_with_scale_reason(corrected.estimate, trial))
     scales = _at_all_frames(corrected.used, trial.start, len(corrected.start_scales))
     estimate = replace(_with_scale_reason(uncorrected.estimate, trial), scales=scales)
-    return _started(Evidence.of(estimate, corrected.normalized, corrected.used, scales), how)
+    return _choose_start(Evidence.of(estimate, corrected.normalized, corrected.used, scales), how)
 
 
 def _with_scale_reason(estimate: CameraEstimate, trial: ScaleTrial) -> CameraEstimate:
@@ -166,11 +166,11 @@ def _refined(evidence: Evidence, trial: ScaleTrial | None, how: Refinement) -> t
     enter(should_stop, "refinement", units=REFINEMENT_UNITS[may_couple])
     found = _first_rounds(evidence, trial, how)
     if bends:
-        evidence, found = settled_again(evidence, found, how)
+        evidence, found = update_correction(evidence, found, how)
     if may_couple and full_mode_covariance.is_identifiable(found.covariance, estimate.sample.shape[1]):
         found = _coupled(evidence.gram, found, how)
         if bends:
-            evidence, found = settled_again(evidence, found, how)
+            evidence, found = update_correction(evidence, found, how)
     if not np.isfinite(found.energy):
         return evidence, found
     return _with_probable_focal(evidence, found) if bends else _with_probable_depth(evidence, found, how)
@@ -180,15 +180,15 @@ def _first_rounds(evidence: Evidence, trial: ScaleTrial | None, how: Refinement)
     """Return cameras and covariance after `REFINEMENT_ROUNDS`, including those of the scale trial if it used the same frames."""
     count = len(evidence.used)
     if trial is not None and trial.start is None and len(trial.fixed.rotations) == count:
-        return how.refined(evidence.gram, trial.fixed, rounds=REFINEMENT_ROUNDS - SCALE_ROUNDS)
+        return how.refine(evidence.gram, trial.fixed, rounds=REFINEMENT_ROUNDS - SCALE_ROUNDS)
     scales = np.ones(count) if trial is None or trial.start is None else trial.start
-    found = how.learned(evidence.gram, evidence.rotations, scales)
-    return how.refined(evidence.gram, found, rounds=REFINEMENT_ROUNDS)
+    found = how.learn(evidence.gram, evidence.rotations, scales)
+    return how.refine(evidence.gram, found, rounds=REFINEMENT_ROUNDS)
 
 
 def _with_probable_depth(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evidence, Learned]:
     """Return cameras and covariance at the most probable depth; if the tracks hardly determine it, the best of all candidates."""
-    found, stretch = settled_depth(evidence.gram, found)
+    found, stretch = at_probable_depth(evidence.gram, found)
     evidence = replace(evidence, estimate=_with_depth_choice(evidence.estimate, stretch))
     if evidence.estimate.depth_is_typical:
         found = best_candidate(evidence, found, how)
@@ -205,7 +205,7 @@ def _with_probable_focal(evidence: Evidence, found: Learned) -> tuple[Evidence, 
     assert view is not None
     if view.given is not None:
         return evidence, found
-    moved, stretch = settled_depth(evidence.gram, found)
+    moved, stretch = at_probable_depth(evidence.gram, found)
     if not is_typical(stretch):
         return evidence, found
     evidence = with_stretched_depth(evidence, moved, stretch)
@@ -250,7 +250,7 @@ def _coupled(gram: Floats, found: Learned, how: Refinement) -> Learned:
     """Return the cameras refined with a covariance between modes (`model.full_mode_covariance`), if they are more probable."""
     scene = scene_at(gram, found.rotations, with_scales=how.with_scales, ordered=found.covariance.ordered)
     cameras = full_mode_covariance.refined(scene, found.scales, found.covariance, should_stop=how.should_stop)
-    again = how.refined(gram, how.learned(gram, *cameras), rounds=COUPLED_ROUNDS)
+    again = how.refine(gram, how.learn(gram, *cameras), rounds=COUPLED_ROUNDS)
     return again if again.energy < found.energy else found
 
 

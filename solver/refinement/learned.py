@@ -71,7 +71,7 @@ class Refinement:
         """Call `should_stop`, if given, and return its answer."""
         return self.should_stop is not None and self.should_stop()
 
-    def learned(self, gram: Floats, rotations: Floats, scales: Floats, *, iterations: int = START_EM_ROUNDS) -> Learned:
+    def learn(self, gram: Floats, rotations: Floats, scales: Floats, *, iterations: int = START_EM_ROUNDS) -> Learned:
         """Return given cameras and a covariance learned for them from scratch, in at most `iterations` EM rounds.
 
         Parameters
@@ -90,23 +90,23 @@ class Refinement:
         )  # fmt: skip
         return Learned(rotations, scales, covariance, np.inf)
 
-    def annealed(self, images: Floats, rotations: Floats, scales: Floats, *, iterations: int) -> Learned:
-        """Return what `learned` returns by annealing alone, without stops, from orthographic tracks `(F, S, 2)`."""
+    def anneal(self, images: Floats, rotations: Floats, scales: Floats, *, iterations: int) -> Learned:
+        """Return what `learn` returns by annealing alone, without stops, from orthographic tracks `(F, S, 2)`."""
         rows = columns(centred(images))
         covariance = annealed(
             rows @ rows.T / rows.shape[1], rotations[:, :2] * scales[:, None, None], iterations=iterations, **asdict(self.model_order)
         )  # fmt: skip
         return Learned(rotations, scales, covariance, np.inf)
 
-    def refined(self, gram: Floats, found: Learned, *, rounds: int) -> Learned:
-        """Return cameras and covariance after `rounds` calls of `refined_once`, fewer after a stop."""
+    def refine(self, gram: Floats, found: Learned, *, rounds: int) -> Learned:
+        """Return cameras and covariance after `rounds` calls of `refine_once`, fewer after a stop."""
         for _ in range(rounds):
             if self.stopped():
                 break
-            found = self.refined_once(gram, found)
+            found = self.refine_once(gram, found)
         return found
 
-    def refined_once(self, gram: Floats, found: Learned, *, factor: Floats | None = None) -> Learned:
+    def refine_once(self, gram: Floats, found: Learned, *, factor: Floats | None = None) -> Learned:
         """Return cameras and covariance of higher likelihood, by L-BFGS from `found`; `gram` and `factor` as for `scene_at`."""
         ordered = found.covariance.ordered
         scene = scene_at(gram, found.rotations, with_scales=self.with_scales, ordered=ordered, factor=factor)
@@ -158,7 +158,7 @@ def moved_to(scene: Scene, found: Learned, moved: Motion, energy: float) -> Lear
     return Learned(*cameras_of(scene, moved), better, energy)
 
 
-def stretched(found: Learned, used: NDArray[np.intp], rotations: Floats) -> Learned:
+def to_all_frames(found: Learned, used: NDArray[np.intp], rotations: Floats) -> Learned:
     """Return cameras and covariance of all frames, given those at the frames used and previous rotations of all frames.
 
     Changes of rotation, logarithms of scales and modes are interpolated.

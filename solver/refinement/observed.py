@@ -156,7 +156,7 @@ def on_observations(
     for _ in range(ROUNDS):
         if how.stopped():
             break
-        found = how.refined_once(moments.gram, found)
+        found = how.refine_once(moments.gram, found)
         moments = _expected(observed, found, moments, start_scales)
     return found, moments
 

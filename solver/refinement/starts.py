@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pliant.solver.cameras.estimation import MAX_HYPOTHESIS_GAP, CameraEstimate, restarted
+from pliant.solver.cameras.estimation import MAX_HYPOTHESIS_GAP, CameraEstimate, with_other_cameras
 from pliant.solver.records import Floats
-from pliant.solver.refinement.bas_relief import settled_depth
+from pliant.solver.refinement.bas_relief import at_probable_depth
 from pliant.solver.refinement.evidence import Evidence
 from pliant.solver.refinement.learned import Learned, Refinement
 from pliant.solver.tracks.frame_selection import evenly_spread, of_frames
@@ -42,7 +42,7 @@ class _Trial:
 
     def refined(self, gram: Floats, how: Refinement) -> _Trial:
         """Return the trial after one more refinement."""
-        return replace(self, found=how.refined_once(gram, self.found))
+        return replace(self, found=how.refine_once(gram, self.found))
 
 
 def best_start(evidence: Evidence, how: Refinement) -> CameraEstimate:
@@ -58,14 +58,14 @@ def best_start(evidence: Evidence, how: Refinement) -> CameraEstimate:
 
     def begun(start: CameraEstimate, margin: float) -> _Trial:
         given = np.asarray(start.rotations)[evidence.used[some]]
-        return _Trial(start, margin, how.learned(part, given, ones, iterations=COMPARED_EM_ROUNDS)).refined(part, how)
+        return _Trial(start, margin, how.learn(part, given, ones, iterations=COMPARED_EM_ROUNDS)).refined(part, how)
 
     own, others = begun(estimate, 0.0), []
     for starts, margin in ((estimate.hypotheses, 0.0), (estimate.candidates, MAX_HYPOTHESIS_GAP)):
         for other in starts:
             if how.stopped():
                 return estimate
-            others.append(begun(restarted(estimate, other), margin))
+            others.append(begun(with_other_cameras(estimate, other), margin))
     others.sort(key=lambda trial: trial.energy)
     finals = [trial.refined(part, how) for trial in (own, *others[:FINALISTS])]
     return min(finals, key=lambda trial: trial.energy).estimate
@@ -81,10 +81,10 @@ def best_candidate(evidence: Evidence, found: Learned, how: Refinement) -> Learn
     for candidate in evidence.estimate.candidates:
         if how.stopped():
             break
-        other = how.learned(gram, candidate.rotations[evidence.used], found.scales)
-        other = how.refined(gram, other, rounds=CANDIDATE_ROUNDS)
+        other = how.learn(gram, candidate.rotations[evidence.used], found.scales)
+        other = how.refine(gram, other, rounds=CANDIDATE_ROUNDS)
         if not np.isfinite(other.energy):
             break
-        other, _ = settled_depth(gram, other)
+        other, _ = at_probable_depth(gram, other)
         found = min(found, other, key=lambda each: each.energy)
     return found

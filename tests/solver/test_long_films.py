@@ -63,7 +63,7 @@ def test_deformation_between_the_learned_frames_is_recovered(film: gallery.Seque
 
 
 class Unrefined(Refinement):
-    def refined_once(self, gram: Floats, found: Learned, *, factor: Floats | None = None) -> Learned:
+    def refine_once(self, gram: Floats, found: Learned, *, factor: Floats | None = None) -> Learned:
         assert factor is not None or len(gram)
         return found
 

@@ -11,7 +11,7 @@ from pliant.solver.cameras.perspective import centred, columns, corrected
 from pliant.solver.evaluation.metrics import e3d_frame_scaled, focal_error
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR, exponential
-from pliant.solver.refinement.focal_length import corrected_energy
+from pliant.solver.refinement.focal_length import CorrectedEnergy
 from pliant.solver.refinement.learned import Learned, motion_of
 
 FRAMES, POINTS = 5, 30
@@ -121,7 +121,7 @@ def test_the_derivative_of_the_energy_with_known_rotations_is_exact() -> None:
     random = np.random.default_rng(4)
     covariance = ShapeCovariance(np.eye(3), np.eye(3), 0.1 * random.normal(size=(FRAMES, 2)), 0.1, 1e-3, np.inf)
     found = Learned(exponential(0.3 * random.normal(size=(FRAMES, 3))), np.ones(FRAMES), covariance, np.inf)
-    energy = corrected_energy(views, 0.2, found, turning=False)
+    energy = CorrectedEnergy(views, 0.2, found, turning=False)
     given = motion_of(energy.scene, found).flat()
     for curvature in (0.17, 0.2):
         more, step = curvature - 0.2, 1e-5

@@ -11,7 +11,7 @@ from pliant.solver.cameras.estimation import (
     CameraEstimate,
     OtherCameras,
     estimate_cameras,
-    restarted,
+    with_other_cameras,
 )
 from pliant.solver.cameras.multistart import CANDIDATES, SMOOTH_STARTS, depth
 from pliant.solver.model.so3 import angles_between, exponential, nearest
@@ -103,6 +103,6 @@ def test_a_chosen_candidate_with_little_rotation_gives_a_warning() -> None:
     still = np.broadcast_to(np.eye(3), (FRAMES, 3, 3))
     turning = exponential(np.linspace(0, 1, FRAMES)[:, None] * np.array([0.0, 1.0, 0.0]))
     own = CameraEstimate(turning, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, np.zeros((0, 0)), np.zeros((FRAMES, 0, 2)))
-    found = restarted(own, OtherCameras(3, still, "others"))
+    found = with_other_cameras(own, OtherCameras(3, still, "others"))
     assert found.warnings
-    assert not restarted(found, OtherCameras(1, turning, "others")).warnings
+    assert not with_other_cameras(found, OtherCameras(1, turning, "others")).warnings

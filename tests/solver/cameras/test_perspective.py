@@ -37,7 +37,7 @@ from pliant.solver.model.marginal_likelihood import UNLIKELY
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
 from pliant.solver.reconstruction.camera_report import described, improbable, with_camera_choice
-from pliant.solver.refinement.focal_length import corrected_energy, unclear_perspective
+from pliant.solver.refinement.focal_length import CorrectedEnergy, unclear_perspective
 from pliant.solver.refinement.learned import Learned, motion_of
 from pliant.solver.shapes import perspective_shapes
 from pliant.solver.tracks import completion
@@ -86,7 +86,7 @@ def test_corrected_tracks_do_not_depend_on_the_size_of_chunks(chunk: int, monkey
     offsets = (normalized.centroid - CENTRE) / normalized.unit
     sample = normalized.points[:, ::3] + offsets[:, None]
     view = Perspective(
-        offsets, CENTRE, curvature=normalized.unit / FOCAL, sample=sample, whole=sample,
+        offsets, CENTRE, curvature=normalized.unit / FOCAL, visible_sample=sample, full_sample=sample,
         depth=depth_map(FACE.rotations, np.ones(len(SEEN)), covariance),
     )  # fmt: skip
     assert normalized.points.shape[1] < completion.POINTS_PER_CHUNK
@@ -97,7 +97,7 @@ def test_corrected_tracks_do_not_depend_on_the_size_of_chunks(chunk: int, monkey
     other, moved, _ = corrected_moments(view, normalized)
     assert other == pytest.approx(gram, abs=1e-12)
     assert moved == pytest.approx(middle, abs=1e-12)
-    assert depths[:, ::3] == pytest.approx(depths_of(view.depth, view.sample, view.curvature), abs=1e-3)
+    assert depths[:, ::3] == pytest.approx(depths_of(view.depth, view.visible_sample, view.curvature), abs=1e-3)
 
 
 @pytest.mark.parametrize("y_up", [False, True])
@@ -168,7 +168,7 @@ def test_the_corrected_energy_gradient_matches_finite_differences() -> None:
     random = np.random.default_rng(6)
     views = random.normal(size=(6, 30, 2)) + random.normal(size=(6, 1, 2))
     found = Learned(rotations, np.ones(6), replace(covariance, noise_variance=0.5), np.inf)
-    energy = corrected_energy(views, 0.13, found)
+    energy = CorrectedEnergy(views, 0.13, found)
     flat = np.append(motion_of(energy.scene, found).flat(), 0.15)
     _, gradient = energy(flat)
     for place in (0, 7, 25, len(flat) - 1):

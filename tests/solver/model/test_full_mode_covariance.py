@@ -113,7 +113,7 @@ def test_modes_along_different_axes_determine_the_cameras() -> None:
     wander = 0.05 * np.stack([np.sin(5 * time + 1), np.cos(3 * time), np.sin(2 * time)], axis=1)
     wrong = exponential(wander) @ rotations
     how = Refinement()
-    before = how.refined(gram, how.learned(gram, wrong, np.ones(FRAMES)), rounds=2)
+    before = how.refine(gram, how.learn(gram, wrong, np.ones(FRAMES)), rounds=2)
     place = scene(gram, before.rotations, with_scales=False, prior_weight=0.01)
     found, scales = refined(place, np.ones(FRAMES), before.covariance)
 

@@ -11,7 +11,7 @@ from pliant.solver.gallery.sequence import Sequence
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR, angles_between, exponential
 from pliant.solver.refinement import bas_relief, joint_refinement
-from pliant.solver.refinement.bas_relief import LOG_DEPTH_STD, VISIBLE_DEPTH, bulges, extent_penalty, settled_depth
+from pliant.solver.refinement.bas_relief import LOG_DEPTH_STD, VISIBLE_DEPTH, at_probable_depth, bulges, extent_penalty
 from pliant.solver.refinement.depth_rounds import with_stretched_depth
 from pliant.solver.refinement.evidence import Evidence
 from pliant.solver.refinement.learned import Learned
@@ -84,24 +84,24 @@ def test_images_change_only_to_second_order_in_the_angles() -> None:
 
 def test_depth_follows_the_tracks_only_with_enough_rotation() -> None:
     gram, deep = found(1, 4.0)
-    settled, stretch = settled_depth(gram, deep)
+    settled, stretch = at_probable_depth(gram, deep)
     assert settled.covariance.mean_covariance[2, 2] ** 0.5 == pytest.approx(4.0 * stretch)
     assert 4.0 * stretch == pytest.approx(VISIBLE_DEPTH, rel=0.3)
     gram, turning = found(60, 1.5)
-    assert settled_depth(gram, turning)[1] == pytest.approx(1, abs=0.01)
+    assert at_probable_depth(gram, turning)[1] == pytest.approx(1, abs=0.01)
 
 
 def test_zero_prior_weight_keeps_the_depth_of_the_tracks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bas_relief, "CAMERA_PRIOR_WEIGHT", 0.0)
     gram, given = found(10, 1.5)
-    assert settled_depth(gram, given)[1] == pytest.approx(1, abs=0.01)
+    assert at_probable_depth(gram, given)[1] == pytest.approx(1, abs=0.01)
 
 
 def test_cameras_from_all_around_are_unchanged() -> None:
     rotations = Rotation.from_euler("y", np.linspace(0, 350, FRAMES)[:, None], degrees=True).as_matrix()
     gram, given = found(10, 1.5)
     around = Learned(rotations, given.scales, given.covariance, 0.0)
-    settled, stretch = settled_depth(gram, around)
+    settled, stretch = at_probable_depth(gram, around)
     assert stretch == 1
     assert settled is around
 
@@ -130,11 +130,11 @@ def test_a_head_that_turns_by_30_degrees_keeps_its_depth(monkeypatch: pytest.Mon
     stretches = []
 
     def settled(gram: np.ndarray, given: Learned) -> tuple[Learned, float]:
-        moved, stretch = settled_depth(gram, given)
+        moved, stretch = at_probable_depth(gram, given)
         stretches.append(stretch)
         return moved, stretch
 
-    monkeypatch.setattr(joint_refinement, "settled_depth", settled)
+    monkeypatch.setattr(joint_refinement, "at_probable_depth", settled)
     head = gallery.face(12, 60, degrees=15)
     tracks, _ = gallery.corrupt_tracks(head.tracks, noise=0.003, seed=0)
     cameras = estimate_cameras(tracks)
@@ -160,7 +160,7 @@ def test_perspective_is_the_same_at_twice_the_depth_and_twice_the_focal_length(m
         before.append(given)
         return bas_relief._stretched(given, 2.0, *bas_relief._decomposed(given.rotations)), 2.0
 
-    monkeypatch.setattr(joint_refinement, "settled_depth", settled)
+    monkeypatch.setattr(joint_refinement, "at_probable_depth", settled)
     settings = Settings(camera="perspective", image_size=(1280.0, 720.0), basis_size=2)
     deep = estimate_cameras(tracks, settings=settings).estimate
     assert deep.perspective is not None
@@ -176,7 +176,7 @@ def test_perspective_is_the_same_at_twice_the_depth_and_twice_the_focal_length(m
     twice = with_stretched_depth(evidence, moved, 2.0).estimate
     assert twice.perspective is not None
     assert twice.perspective.curvature == 0.02
-    view = deep.perspective.sample
+    view = deep.perspective.visible_sample
     bent = (plain.sample - view + view.mean(axis=1, keepdims=True)).std()
     assert bent > 0.005
     assert (twice.sample - plain.sample).std() < 0.1 * bent
@@ -184,7 +184,7 @@ def test_perspective_is_the_same_at_twice_the_depth_and_twice_the_focal_length(m
 
 @pytest.mark.slow
 def test_a_given_focal_length_determines_the_depth(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(joint_refinement, "settled_depth", None)
+    monkeypatch.setattr(joint_refinement, "at_probable_depth", None)
     settings = Settings(focal=900.0, image_size=(1280.0, 720.0), basis_size=2)
     found = estimate_cameras(nearby(gallery.face(8, 40, degrees=4)), settings=settings).estimate
     assert not found.depth_is_typical

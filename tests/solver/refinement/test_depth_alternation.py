@@ -12,7 +12,7 @@ from pliant.solver.evaluation.metrics import e3d_frame_scaled
 from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.refinement import depth_rounds
-from pliant.solver.refinement.depth_alternation import aligned, alternated, factorized_again
+from pliant.solver.refinement.depth_alternation import aligned, alternate, refactorize
 from pliant.solver.refinement.learned import Learned, Refinement
 
 PICTURE = (1280.0, 720.0)
@@ -37,7 +37,7 @@ def rigid() -> tuple[np.ndarray, Perspective, np.ndarray]:
     rotations = exponential(np.linspace(0, 1.4, 12)[:, None] * np.array([0.2, 1.0, 0.1]))
     seen = (cloud - cloud.mean(axis=0)) @ rotations.transpose(0, 2, 1) / 1.5
     view = Perspective(
-        np.zeros((12, 2)), np.zeros(2), curvature=0.25, sample=seen[..., :2] / (1 + 0.25 * seen[..., 2:])
+        np.zeros((12, 2)), np.zeros(2), curvature=0.25, visible_sample=seen[..., :2] / (1 + 0.25 * seen[..., 2:])
     )
     flat = columns(centred(seen[..., :2]))
     return rotations, view, flat @ flat.T / 40
@@ -53,12 +53,12 @@ def test_a_new_factorization_corrects_cameras_that_are_off(
     given = exponential(off) @ rotations
     start = Learned(given, np.ones(12), annealed(gram, given[:, :2], iterations=30), np.inf)
     used = np.arange(12)
-    found, moved = alternated(view, start, used, Refinement())
+    found, moved = alternate(view, start, used, Refinement())
     moved = replace(moved, depth=depth_map(found.rotations, found.scales, found.covariance))
-    better = factorized_again(found.scales, moved, found, used, Refinement())
+    better = refactorize(found.scales, moved, found, used, Refinement())
     turned = found.rotations if better is None else better
     assert np.degrees(angles_between(aligned(turned, rotations, used), rotations)).max() < 0.5
-    assert factorized_again(found.scales, moved, found, used, Refinement(should_stop=lambda: True)) is None
+    assert refactorize(found.scales, moved, found, used, Refinement(should_stop=lambda: True)) is None
 
 
 def test_a_round_that_leads_to_extreme_depths_is_discarded(
@@ -67,7 +67,7 @@ def test_a_round_that_leads_to_extreme_depths_is_discarded(
     rotations, view, gram = rigid
     covariance = annealed(gram, rotations[:, :2], iterations=5)
     given = Learned(rotations, np.ones(12), replace(covariance, mean_covariance=1e19 * np.eye(3)), np.inf)
-    found, moved = alternated(view, given, np.arange(12), Refinement())
+    found, moved = alternate(view, given, np.arange(12), Refinement())
     assert found is given
     assert moved is view
 

@@ -13,7 +13,7 @@ from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.so3 import angles_between, exponential, logarithm, nearest
 from pliant.solver.records import Floats
 from pliant.solver.refinement.focal_length import _Comparison, search
-from pliant.solver.refinement.learned import Learned, Refinement, stretched
+from pliant.solver.refinement.learned import Learned, Refinement, to_all_frames
 from pliant.solver.tracks.frame_selection import evenly_spread
 
 CURVATURE = 0.18
@@ -51,7 +51,7 @@ def test_noise_and_cameras_that_turn_too_little_do_not_hide_perspective() -> Non
     face = seen_face(32, 300, noise=0.01)
     view, found = search(face.views, face.start, np.ones(32), view_of(32), Refinement(ModelOrder(noisy_start=True)))
     assert view.curvature == pytest.approx(CURVATURE, rel=0.1)
-    assert view.settled
+    assert view.sign_known
     assert face.off(found.rotations) < 0.5 * face.off(face.start)
     nll = [each.nll for each in view.candidates]
     falling = np.diff(nll) < 0
@@ -92,9 +92,9 @@ def test_cameras_of_some_frames_are_extended_to_all() -> None:
     used = evenly_spread(9, 5)
     comparison = _Comparison.of(face.views[used], face.start[used], np.ones(5), Refinement())
     found = comparison.trials[0.0].found
-    every = stretched(found, used, face.start)
+    every = to_all_frames(found, used, face.start)
     assert every.rotations[used] == pytest.approx(found.rotations, abs=1e-9)
     assert every.scales == pytest.approx(np.ones(9))
     assert len(every.covariance.modes) == 9
     whole = Learned(face.start, np.ones(9), every.covariance, 0.0)
-    assert stretched(whole, np.arange(9), face.rotations) is whole
+    assert to_all_frames(whole, np.arange(9), face.rotations) is whole

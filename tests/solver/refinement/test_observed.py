@@ -58,7 +58,7 @@ def test_a_point_is_judged_by_a_covariance_of_the_others() -> None:
 def test_expected_moments_are_nearer_to_the_truth_than_completed_tracks(outliers: float) -> None:
     tracks = gallery.corrupt(MADE, noise=0.005, hidden=0.4, outliers=outliers, seed=3).tracks
     observed, _, completed = begun(tracks)
-    start = KEPT.learned(completed.gram, np.asarray(KNOWN.rotations), ONES)
+    start = KEPT.learn(completed.gram, np.asarray(KNOWN.rotations), ONES)
     found, moments = on_observations(observed, start, completed, ONES, KEPT)
     np.testing.assert_array_equal(found.rotations, KNOWN.rotations)
     true = true_sample(normalize(tracks).unit)
@@ -75,7 +75,7 @@ def test_perspective_is_corrected_with_the_depths_of_the_expected_tracks() -> No
     """Tracks of a pinhole give the moments that the same tracks give under orthography."""
     tracks = gallery.corrupt(MADE, hidden=0.2, seed=2).tracks
     observed, _, completed = begun(tracks)
-    start = KEPT.learned(completed.gram, np.asarray(KNOWN.rotations), ONES)
+    start = KEPT.learn(completed.gram, np.asarray(KNOWN.rotations), ONES)
     _, flat = on_observations(observed, start, completed, ONES, KEPT)
     unit, curvature = normalize(tracks).unit, 0.1
     depths = np.einsum("fj,fpj->fp", MADE.rotations[:, 2], MADE.shapes) / unit
@@ -93,7 +93,7 @@ def test_perspective_is_corrected_with_the_depths_of_the_expected_tracks() -> No
 def test_a_stop_leaves_the_cameras() -> None:
     tracks = gallery.corrupt(MADE, hidden=0.2, seed=2).tracks
     observed, _, completed = begun(tracks)
-    start = KEPT.learned(completed.gram, np.asarray(KNOWN.rotations), ONES)
+    start = KEPT.learn(completed.gram, np.asarray(KNOWN.rotations), ONES)
     found, moments = on_observations(observed, start, completed, ONES, Refinement(should_stop=lambda: True))
     assert found is start
     assert np.isfinite(moments.gram).all()
