@@ -16,13 +16,11 @@ from pliant.solver.agreement import check_agreement
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import pulses_to
-from pliant.solver.reconstruction.blocks import needs_blocks, shapes_in_blocks
+from pliant.solver.reconstruction.blocks import needs_blocks
 from pliant.solver.reconstruction.cameras import Cameras, cameras_of
 from pliant.solver.reconstruction.observations import Observations, monitored, observe
 from pliant.solver.reconstruction.prior import Prior, prior_of
-from pliant.solver.reconstruction.shapes import shapes_from
-from pliant.solver.reconstruction.solution import in_world_unit
-from pliant.solver.reconstruction.start import Start, prepared, with_outlier_reason, with_outliers_rejected
+from pliant.solver.reconstruction.solve_shapes import shapes_of
 from pliant.solver.reconstruction.surface import isometric_verdict, solution_of, tries_isometry, with_verdict
 from pliant.solver.records import KnownCamera, Step, Tracks
 from pliant.solver.settings import Settings
@@ -106,36 +104,12 @@ def _solved(
     cameras, prior = _learned(observations, monitor)
     monitor.report(Step("cameras", 0.0, max_reweightings=settings.max_reweightings))
     learning = time.perf_counter() - began
-    if needs_blocks(tracks, settings):
-        cameras = replace(
-            cameras, observations=cameras.observations.without_points()
-        )  # blocks take their points from the tracks
-        solution = shapes_in_blocks(
-            tracks, cameras, prior, mesh, settings, monitor, seconds={"cameras": learning}, scratch=scratch
-        )
-    else:
-        seconds = {"cameras": learning, "initialise": 0.0}
-        start = _started(tracks, cameras, prior, mesh, settings, monitor, seconds)
-        solution = shapes_from(start, monitor, seconds=seconds)
-    solution = in_world_unit(solution, observations.world_scale)
+    if needs_blocks(tracks, settings):  # which take their points from the tracks
+        cameras = replace(cameras, observations=cameras.observations.without_points())
+    solution = shapes_of(
+        tracks, cameras, prior, mesh, settings, monitor, seconds={"cameras": learning}, scratch=scratch
+    )
     return solution if verdict is None else with_verdict(solution, tracks, verdict, settings, monitor, began=began)
-
-
-def _started(
-    tracks: Tracks,
-    cameras: Cameras,
-    prior: Prior | None,
-    mesh: Mesh | None,
-    settings: Settings,
-    monitor: Monitor,
-    seconds: dict[str, float],
-) -> Start:
-    """Return the starting shapes with gross outliers rejected, and add the time to `seconds`."""
-    monitor.enter("start")
-    began = time.perf_counter()
-    start = with_outliers_rejected(prepared(tracks, cameras, prior, mesh, settings, should_stop=monitor), monitor)
-    seconds["initialise"] += time.perf_counter() - began
-    return with_outlier_reason(start)
 
 
 def _learned(observations: Observations, monitor: Monitor) -> tuple[Cameras, Prior | None]:

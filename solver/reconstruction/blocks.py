@@ -24,14 +24,7 @@ from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import monitored
 from pliant.solver.reconstruction.prior import Prior, changes_of, estimate_with
 from pliant.solver.reconstruction.shapes import shapes_from
-from pliant.solver.reconstruction.start import (
-    Start,
-    outlier_reason,
-    prepared,
-    warm,
-    with_outlier_reason,
-    with_outliers_rejected,
-)
+from pliant.solver.reconstruction.start import begin, outlier_reason, prepared
 from pliant.solver.records import Choices, Floats, Ints, Step, Tracks, read_only
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.assessment import judged
@@ -84,12 +77,8 @@ def shapes_in_blocks(
         part, surface = _part(tracks, kept), None if mesh is None else mesh_of(mesh, kept)
         inner = _monitor_of(part, settings, monitor, number, len(groups))
         first = None if start is None else start[:, kept]
-        solution = shapes_from(
-            _start_of(part, cameras, prior, surface, settings, inner, bending, first),
-            inner,
-            seconds={},
-            changes=changes,
-        )
+        begun = [begin(part, cameras, prior, surface, settings, inner, shapes=first, moving=False, bending=bending)]
+        solution = shapes_from(begun.pop(), inner, seconds={}, changes=changes)
         whole.add(solution, own, np.searchsorted(kept, own))
         del part, surface, solution  # before the next block
     solution = whole.solution(seconds={**seconds, "shapes": time.perf_counter() - began, "finish": 0.0})
@@ -101,22 +90,6 @@ def _part(tracks: Tracks, kept: NDArray[np.intp]) -> Tracks:
     points = tracks.points[:, kept]
     pulse()
     return Tracks.from_arrays(points, tracks.visible[:, kept])
-
-
-def _start_of(
-    part: Tracks,
-    cameras: Cameras,
-    prior: Prior | None,
-    mesh: Mesh | None,
-    settings: Settings,
-    monitor: Monitor,
-    bending: float | None,
-    shapes: Floats | None,
-) -> Start:
-    """Return the start of the points of `part`, without gross outliers; at `shapes`, if given."""
-    start = prepared(part, cameras, prior, mesh, settings, moving=False, bending=bending, should_stop=monitor)
-    start = with_outlier_reason(with_outliers_rejected(start, monitor))
-    return start if shapes is None else warm(start, shapes)
 
 
 def _bending(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from pliant.solver.agreement import check_mesh
 from pliant.solver.mesh import Mesh
+from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.blocks import needs_blocks, shapes_in_blocks
 from pliant.solver.reconstruction.cameras import Cameras
@@ -15,14 +16,7 @@ from pliant.solver.reconstruction.observations import OnStep, ShouldStop, monito
 from pliant.solver.reconstruction.prior import Prior, changes_of
 from pliant.solver.reconstruction.shapes import shapes_from
 from pliant.solver.reconstruction.solution import in_world_unit
-from pliant.solver.reconstruction.start import (
-    check_shapes,
-    prepared,
-    warm,
-    with_outlier_reason,
-    with_outliers_rejected,
-    without_learned_prior,
-)  # fmt: skip
+from pliant.solver.reconstruction.start import begin, check_shapes, without_learned_prior
 from pliant.solver.records import Floats, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.solution import Solution
@@ -76,30 +70,46 @@ def solve_shapes(
     OSError
         The folder `scratch` is missing, cannot be written to, or has too little space.
     """
-    began = time.perf_counter()
     observations = cameras.observations.of(tracks)
     first = None if start is None else np.asarray(start.shapes if isinstance(start, Solution) else start, dtype=float)
     if first is not None:
         check_shapes(first, tracks)
-        first = first * observations.world_scale
     settings = settings if settings is not None else observations.settings
     check_mesh(tracks, mesh, settings)
     settings = without_learned_prior(settings) if prior is None else settings
     monitor = monitored(tracks, None, settings, on_step, should_stop, only=("shapes", "finish", "trust"))
     with pulses_to(monitor.pulse):
-        if needs_blocks(tracks, settings):
-            solution = shapes_in_blocks(
-                tracks, cameras, prior, mesh, settings, monitor, seconds={}, start=first, scratch=scratch
-            )
-            return in_world_unit(solution, observations.world_scale)
-        begun = prepared(tracks, cameras, prior, mesh, settings, should_stop=monitor)
-        begun = with_outlier_reason(with_outliers_rejected(begun, monitor))
-        if first is not None:
-            begun = warm(begun, first)
+        return shapes_of(
+            tracks, cameras, prior, mesh, settings, monitor,
+            seconds={}, start=None if first is None else first * observations.world_scale, scratch=scratch,
+        )  # fmt: skip
+
+
+def shapes_of(
+    tracks: Tracks,
+    cameras: Cameras,
+    prior: Prior | None,
+    mesh: Mesh | None,
+    settings: Settings,
+    monitor: Monitor,
+    *,
+    seconds: dict[str, float],
+    start: Floats | None = None,
+    scratch: str | Path | None = None,
+) -> Solution:
+    """Return the solution, at once or in blocks of points; `seconds` is the time per stage so far, `start` and `scratch` as above."""
+    if needs_blocks(tracks, settings):
+        solution = shapes_in_blocks(
+            tracks, cameras, prior, mesh, settings, monitor, seconds=seconds, start=start, scratch=scratch
+        )
+    else:
+        monitor.enter("start")
+        began = time.perf_counter()
+        begun = [begin(tracks, cameras, prior, mesh, settings, monitor, shapes=start)]
         changes = None  # computed with the final confidence, where the tracks are those of the cameras
         if prior is not None and tracks is not cameras.observations.tracks:
             changes = changes_of(tracks, cameras, prior, seed=settings.seed, should_stop=monitor)
-        seconds, starts = {"initialise": time.perf_counter() - began}, [begun]
-        del begun, first  # so that `shapes_from` has the only reference and can release the first state
-        solution = shapes_from(starts.pop(), monitor, seconds=seconds, changes=changes)
-        return in_world_unit(solution, observations.world_scale)
+        seconds = {**seconds, "initialise": time.perf_counter() - began}
+        del start  # and `pop`: so that `shapes_from` has the only reference and can release the first state
+        solution = shapes_from(begun.pop(), monitor, seconds=seconds, changes=changes)
+    return in_world_unit(solution, cameras.observations.world_scale)

@@ -110,10 +110,30 @@ def find_outliers(
     used = cameras.observations.settings if settings is None else settings
     monitor = monitored(tracks, None, used, on_step, should_stop, only=("shapes",))
     with pulses_to(monitor.pulse):
-        start = prepared(tracks, cameras, prior, mesh, settings, should_stop=monitor)
-        found = with_outliers_rejected(start, monitor).rejected()
+        found = begin(tracks, cameras, prior, mesh, settings, monitor).rejected()
     monitor.report(Step("finish", 1.0))
     return found
+
+
+def begin(
+    tracks: Tracks,
+    cameras: Cameras,
+    prior: Prior | None,
+    mesh: Mesh | None,
+    settings: Settings | None,
+    monitor: Monitor,
+    *,
+    shapes: Floats | None = None,
+    moving: bool = True,
+    bending: float | None = None,
+) -> Start:
+    """Return the start of the minimisation with gross outliers rejected; parameters and errors as for `prepared` and `warm`.
+
+    The initial shapes are `shapes`, if given, and least-squares ones otherwise.
+    """
+    start = prepared(tracks, cameras, prior, mesh, settings, moving=moving, bending=bending, should_stop=monitor)
+    start = _with_outlier_reason(_with_outliers_rejected(start, monitor))
+    return start if shapes is None else warm(start, shapes)
 
 
 def prepared(
@@ -123,7 +143,7 @@ def prepared(
     mesh: Mesh | None,
     settings: Settings | None,
     *,
-    moving: bool = True,
+    moving: bool,
     bending: float | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Start:
@@ -240,7 +260,7 @@ def without_learned_prior(settings: Settings) -> Settings:
     return replace(settings, prior="smooth", order="film") if settings.gaussian else settings
 
 
-def with_outliers_rejected(start: Start, monitor: Monitor) -> Start:
+def _with_outliers_rejected(start: Start, monitor: Monitor) -> Start:
     """Return the start without gross outliers; unchanged without a learned prior or with hardly any outliers."""
     problem, covariance, filling = start.problem, start.covariance, start.estimate.filling
     if covariance is None or filling is None or problem.weights.temporal == 0 or start.outliers <= OUTLIER_SHARE:
@@ -255,7 +275,7 @@ def with_outliers_rejected(start: Start, monitor: Monitor) -> Start:
     return replace(start, problem=without, state=init(without, start.state.shapes, start.state.translations))
 
 
-def with_outlier_reason(start: Start) -> Start:
+def _with_outlier_reason(start: Start) -> Start:
     """Return the start with a sentence on the share of rejected observations, if outliers were searched for."""
     outliers = start.outliers
     if start.covariance is None or start.problem.weights.temporal == 0 or outliers <= OUTLIER_SHARE:
