@@ -130,6 +130,11 @@ class Camera:
     y_up: bool = False
     """Whether y of the tracks points up, so that depth is minus the third coordinate."""
 
+    def __post_init__(self) -> None:
+        """Make the arrays read-only."""
+        for array in (self.rotations, self.scales, self.translations, self.principal_point):
+            read_only(array)
+
     def depths(self, shapes: Floats) -> Floats:
         """Return z = ± s_f R_f[2] x, the depth behind each frame's origin in image units, shape `(F, P)`; minus if `y_up`."""
         sign = -1.0 if self.y_up else 1.0

@@ -104,6 +104,12 @@ class Solution:
     (1 − α) p / ((1 − α) p + α / A) with α the share of outliers, A the area of the tracks, and p the density of the loss at the scale of
     the noise; see `pliant.solver.shapes.inliers`."""
 
+    def __post_init__(self) -> None:
+        """Make the arrays read-only."""
+        for array in (self.shapes, self.residuals, self.weights, self.shapes_std, self.inlier_probability):
+            if array is not None:
+                read_only(array)
+
     def __repr__(self) -> str:
         frames, points, _ = self.shapes.shape
         verdict = "" if self.trust is None else f", {self.trust.verdict}"

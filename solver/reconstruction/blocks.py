@@ -25,7 +25,7 @@ from pliant.solver.reconstruction.observations import monitored
 from pliant.solver.reconstruction.prior import Prior, changes_of, estimate_with
 from pliant.solver.reconstruction.shapes import shapes_from
 from pliant.solver.reconstruction.start import begin, outlier_reason, prepared
-from pliant.solver.records import Choices, Floats, Ints, Step, Tracks, read_only
+from pliant.solver.records import Choices, Floats, Ints, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.assessment import judged
 from pliant.solver.shapes.sparsely_observed import mesh_of
@@ -221,8 +221,6 @@ class _Whole:
             mean[:] = shape.mean(axis=0)
             shape -= mean
         camera = first.camera.centred_on(middle)
-        for array in (self._shapes, camera.scales, camera.translations, *self._others.values()):
-            read_only(array)
         let_go(self._shapes)
         order = (Outcome.STOPPED, Outcome.REJECTED, Outcome.MAX_REWEIGHTINGS, Outcome.CONVERGED)
         found = {part.outcome for part in self._parts}

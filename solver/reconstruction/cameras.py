@@ -16,7 +16,7 @@ from pliant.solver.monitor import Monitor, enter
 from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.long_films import extended
 from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, monitored, observe
-from pliant.solver.records import MIN_POINTS, Camera, Floats, KnownCamera, Step, Tracks, read_only
+from pliant.solver.records import MIN_POINTS, Camera, Floats, KnownCamera, Step, Tracks
 from pliant.solver.refinement.covariance_learning import LearningData, learn_covariance
 from pliant.solver.refinement.depth_rounds import correct_perspective
 from pliant.solver.refinement.evidence import Evidence
@@ -219,6 +219,4 @@ def camera_of(estimate: CameraEstimate, observations: Observations) -> Camera:
     if view is not None and view.bends:
         focal = normalized.unit / abs(view.curvature)
         camera = replace(camera, focal=focal, focal_std=view.focal_std(normalized.unit))
-    for array in (camera.rotations, camera.scales, camera.translations, camera.principal_point):
-        read_only(array)
     return camera

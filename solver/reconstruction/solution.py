@@ -11,7 +11,7 @@ from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import largest_weight
 from pliant.solver.limits import frame_chunks
 from pliant.solver.pulse import pulse
-from pliant.solver.records import Camera, Choices, Floats, read_only
+from pliant.solver.records import Camera, Choices, read_only
 from pliant.solver.shapes.state import State
 from pliant.solver.solution import Outcome, Solution, Trace
 from pliant.solver.tracks.normalization import Normalized
@@ -50,9 +50,6 @@ def finish(
         unit * np.array([s.residual for s in history]),
         np.array([s.iterations for s in history], dtype=np.int32),
     )
-    arrays: list[Floats] = [shapes, camera.rotations, camera.scales, camera.translations, residual, trust]
-    for array in arrays:
-        read_only(array)
     return Solution(shapes, camera, residual, trust, trace, outcome, choices, {})
 
 
@@ -67,6 +64,4 @@ def in_world_unit(solution: Solution, world_scale: float) -> Solution:
                 pulse()
                 frame /= world_scale
             read_only(array)
-    scales = solution.camera.scales * world_scale
-    read_only(scales)
-    return replace(solution, camera=replace(solution.camera, scales=scales))
+    return replace(solution, camera=replace(solution.camera, scales=solution.camera.scales * world_scale))

@@ -14,7 +14,7 @@ from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.evaluation.trust import Trust, assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.pulse import pulse
-from pliant.solver.records import Camera, Floats, Tracks, read_only
+from pliant.solver.records import Camera, Floats, Tracks
 from pliant.solver.refinement.focal_length import MIN_PERSPECTIVE_GAIN, more_probable, unclear_perspective
 from pliant.solver.shapes.held_out import held_out_error
 from pliant.solver.shapes.jackknife import Changes, learning_changes
@@ -107,7 +107,6 @@ def assessed(
         if free_scales and np.ptp(solution.camera.scales) > 0:
             with_size_std(std, solution.shapes, centred=centred)
         held_out = held_out_error(tracks, solution.shapes, solution.camera, confidence, covariance, unit=unit)
-        read_only(std)
     tick()
     solution = replace(solution, shapes_std=std)
     trust = judged(solution, tracks, confidence, estimate, covariance, unit, held_out_error=held_out)

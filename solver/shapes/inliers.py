@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 from pliant.solver.limits import frame_chunks
 from pliant.solver.pulse import pulse
-from pliant.solver.records import Floats, Tracks, read_only
+from pliant.solver.records import Floats, Tracks
 from pliant.solver.solution import Solution
 from pliant.solver.tracks.noise import weighted_median
 from pliant.solver.tracks.normalization import relative
@@ -75,7 +75,6 @@ def with_inlier_probability(
         extent=high - low,
         loss=loss,
     )
-    read_only(probability)
     return replace(solution, inlier_probability=probability)
 
 

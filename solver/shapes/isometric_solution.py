@@ -13,7 +13,7 @@ import numpy as np
 from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.evaluation.trust import assess_isometric
 from pliant.solver.isometry.surface import IsometricSurface, IsometricVerdict
-from pliant.solver.records import Camera, Choices, Floats, Tracks, read_only
+from pliant.solver.records import Camera, Choices, Floats, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.solution import Outcome, Solution, Trace
 
@@ -57,8 +57,6 @@ def isometric_solution(
     residual = np.where(seen, np.linalg.norm(camera.project(shapes) - tracks.points, axis=2), 0.0)
     weights = (seen & ~surface.outliers & surface.placed).astype(np.float64)
     median = float(np.median(residual[seen]))
-    for array in (shapes, residual, weights):
-        read_only(array)
     trace = Trace(np.array([surface.inconsistency]), np.array([median]), np.zeros(1, dtype=np.int32))
     choices = _choices(verdict, surface, unit, float(surface.outliers.sum() / seen.sum()))
     return Solution(
@@ -80,8 +78,6 @@ def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera]:
     shapes = unit * (centred @ rotations)
     point = np.array(surface.principal_point)
     translations = point + scales[:, None] * origin[:, :2]
-    for array in (rotations, scales, translations):
-        read_only(array)
     return shapes, Camera(rotations, scales / unit, translations, surface.focal, principal_point=point)
 
 
@@ -100,8 +96,6 @@ def upwards(camera: Camera) -> Camera:
     """Return the camera for the tracks with y reversed: rotated by half a turn about x."""
     half_turn = np.diag([1.0, -1.0, -1.0])
     rotations, translations = half_turn @ camera.rotations, camera.translations * (1.0, -1.0)
-    for array in (rotations, translations):
-        read_only(array)
     return replace(
         camera,
         rotations=rotations,

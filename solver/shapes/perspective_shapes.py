@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import Perspective, corrected_tracks
 from pliant.solver.energy.problem import Problem
-from pliant.solver.records import Camera, Floats, Tracks, read_only
+from pliant.solver.records import Camera, Floats, Tracks
 from pliant.solver.shapes.state import State
 from pliant.solver.solution import Solution
 from pliant.solver.tracks.normalization import Normalized
@@ -66,7 +66,6 @@ def seen_in_perspective(
     """
     camera = replace(solution.camera, principal_point=np.array(view.principal_point))
     if not view.bends:
-        read_only(camera.principal_point)
         return replace(solution, camera=camera)
     focal = unit / abs(view.curvature)
     scales, translations = camera.scales, camera.translations
@@ -79,6 +78,4 @@ def seen_in_perspective(
     )  # fmt: skip
     left = tracks.points - camera.project(solution.shapes)
     residuals: Floats = np.where(tracks.visible > 0, np.hypot(left[..., 0], left[..., 1]), 0.0)
-    for array in (camera.scales, camera.translations, camera.principal_point, residuals):
-        read_only(array)
     return replace(solution, camera=camera, residuals=residuals)

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.limits import MAX_UNORDERED_FRAMES
-from pliant.solver.records import Camera, Floats, KnownCamera, Tracks, read_only
+from pliant.solver.records import Camera, Floats, KnownCamera, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.solution import Solution
 from pliant.solver.tracks.frame_selection import evenly_spread
@@ -128,9 +128,7 @@ def as_they_came(solution: Solution, order: NDArray[np.intp]) -> Solution:
     back = np.argsort(order)
 
     def moved(values: Floats) -> Floats:
-        result = np.ascontiguousarray(values[back])
-        read_only(result)
-        return result
+        return np.ascontiguousarray(values[back])
 
     camera: Camera = replace(
         solution.camera,
