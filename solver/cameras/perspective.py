@@ -32,6 +32,7 @@ from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import Filling, often_visible, spans
+from pliant.solver.tracks.matrix import centred, columns
 from pliant.solver.tracks.normalization import Normalized
 from scipy import linalg
 
@@ -139,16 +140,6 @@ def depth_map(rotations: Floats, scales: Floats, covariance: ShapeCovariance) ->
     wide = np.repeat(covariance.over_frames(), 2, axis=1)
     cross = away @ covariance.mean_covariance @ rows.T + (away @ covariance.axis_covariance @ rows.T) * wide
     return np.asarray(linalg.solve(covariance.of_image(projections), cross.T, assume_a="pos").T)
-
-
-def columns(points: Floats) -> Floats:
-    """Return points `(F, P, 2)` as a matrix `(2F, P)` with rows x1, y1, x2 and so on."""
-    return np.asarray(points.transpose(0, 2, 1).reshape(2 * len(points), -1))
-
-
-def centred(points: Floats) -> Floats:
-    """Subtract each frame's mean point."""
-    return np.asarray(points - points.mean(axis=1, keepdims=True))
 
 
 def depths_of(

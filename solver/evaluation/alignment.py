@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from pliant.solver.errors import InvalidInput
 from pliant.solver.model.so3 import MIRROR
 from pliant.solver.records import Floats
+from pliant.solver.tracks.matrix import centred
 
 Kind = Literal["sequence", "frame", "frame_scaled", "frame_similarity"]
 
@@ -100,11 +101,6 @@ def procrustes(products: Floats, *, proper: bool = False) -> Floats:
         sign = np.sign(np.linalg.det(left) * np.linalg.det(right))
         left[..., :, 2] *= sign[..., None]
     return np.asarray(left @ right)
-
-
-def centred(shapes: Floats) -> Floats:
-    """Return the points minus each frame's mean point."""
-    return np.asarray(shapes - shapes.mean(axis=1, keepdims=True))
 
 
 def frobenius(shapes: Floats) -> Floats:

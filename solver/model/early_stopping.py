@@ -27,6 +27,7 @@ from pliant.solver.model.model_order import MIN_JUDGED_POINTS, MIN_NLL_GAIN, Mod
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import MAX_SAMPLE_POINTS
+from pliant.solver.tracks.matrix import columns
 
 FOLDS = 3
 """Folds of the cross-validation over points."""
@@ -115,7 +116,7 @@ def schedule(
     frames, count = sample.shape[:2]
     if not MIN_JUDGED_POINTS <= count < min(2 * frames, MAX_SAMPLE_POINTS):
         return None
-    points = sample.transpose(0, 2, 1).reshape(2 * frames, count)
+    points = columns(sample)
     ways = [
         Schedule(replace(model_order, max_modes=each), floors)
         for each in sorted({model_order.max_modes, MAX_MODES})

@@ -21,6 +21,7 @@ from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import ranks
 from pliant.solver.tracks.frame_selection import evenly_spread
+from pliant.solver.tracks.matrix import columns
 from pliant.solver.tracks.noise import typical_roughness
 
 MODE_COUNTS = (0, 2, 4, 8, 16, 32, MAX_MODES)
@@ -80,7 +81,7 @@ def select_model_order(
     if count < MIN_JUDGED_POINTS or typical_roughness(sample) < NOISE_STD_FLOOR:
         return ModelOrder(ordered=ordered)
     used = evenly_spread(frames, JUDGED_FRAMES)
-    rows = sample[used].transpose(0, 2, 1).reshape(2 * len(used), count)
+    rows = columns(sample[used])
     order = np.argsort(ranks(sample))[np.random.default_rng(seed).permutation(count)]
     one, other = rows[:, order[0::2]], rows[:, order[1::2]]
     quiet_start, noisy_start = (

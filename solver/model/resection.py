@@ -24,6 +24,7 @@ from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential, from_rows, logarithm
 from pliant.solver.records import Floats
 from pliant.solver.threads import over_ranges
+from pliant.solver.tracks.matrix import columns
 from scipy.spatial.transform import Rotation, Slerp
 
 MAX_STEPS = 12
@@ -68,9 +69,8 @@ class MeanShapes:
     def of(cls, covariance: ShapeCovariance, rotations: Floats, scales: Floats, sample: Floats) -> MeanShapes:
         """Return the shapes for cameras and complete tracks `(F, S, 2)` of the frames that the covariance was learned from."""
         projections = rotations[:, :2] * scales[:, None, None]
-        frames, count = covariance.modes.shape
-        images = sample.transpose(0, 2, 1).reshape(2 * frames, -1)
-        found = Explained.of(covariance.image_model(projections), images).means.reshape(count + 1, 3, -1)
+        found = Explained.of(covariance.image_model(projections), columns(sample)).means
+        found = found.reshape(covariance.modes.shape[1] + 1, 3, -1)
         off = covariance.modes[1:-1] - (covariance.modes[:-2] + covariance.modes[2:]) / 2
         middle = exponential(logarithm(rotations[2:] @ rotations[:-2].transpose(0, 2, 1)) / 2) @ rotations[:-2]
         turn = logarithm(rotations[1:-1] @ middle.transpose(0, 2, 1))

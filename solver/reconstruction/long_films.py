@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.perspective import Perspective, centred, columns, corrected, depth_map
+from pliant.solver.cameras.perspective import Perspective, corrected, depth_map
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.resection import MeanShapes, Poses, Views, interpolated, predicted, resected
 from pliant.solver.model.shape_covariance import ShapeCovariance
@@ -25,6 +25,7 @@ from pliant.solver.records import Floats, read_only
 from pliant.solver.refinement.covariance_learning import LearningData
 from pliant.solver.refinement.learned import Learned, Refinement
 from pliant.solver.tracks.completion import Filling, gross
+from pliant.solver.tracks.matrix import centred, columns
 
 PREDICTED_TOGETHER = 256
 """Maximum number of frames predicted at once, to bound the memory."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pliant.solver.cameras.factorization import upgrade
-from pliant.solver.cameras.perspective import Perspective, centred, columns, corrected, depth_map, depths_of
+from pliant.solver.cameras.perspective import Perspective, corrected, depth_map, depths_of
 from pliant.solver.records import Floats
 from pliant.solver.refinement.depth_alternation import aligned
 from pliant.solver.refinement.focal_length import (
@@ -23,6 +23,7 @@ from pliant.solver.refinement.focal_length import (
     refine_with_focal,
 )
 from pliant.solver.refinement.learned import Learned, Refinement
+from pliant.solver.tracks.matrix import centred, columns
 
 SIZES = (2, 5)
 """K of the factorizations. A rigid object (K = 1) deforms too little to need them; with 3 and 8 as well, errors are about the same."""

@@ -26,6 +26,7 @@ from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, energy
 from pliant.solver.model.so3 import exponential
 from pliant.solver.records import Floats
 from pliant.solver.refinement.learned import Learned, motion_of, scene_at
+from pliant.solver.tracks.matrix import columns
 from scipy.optimize import minimize_scalar
 from scipy.special import polygamma
 
@@ -107,7 +108,7 @@ def bulges(found: Learned, sample: Floats, *, y_up: bool) -> bool:
     """
     frames = len(sample)
     rows = (found.rotations[:, :2] * found.scales[:, None, None]).reshape(2 * frames, 3)
-    rigid = np.linalg.pinv(rows) @ sample.transpose(0, 2, 1).reshape(2 * frames, -1)
+    rigid = np.linalg.pinv(rows) @ columns(sample)
     toward = _decomposed(found.rotations)[0]
     depth = (toward @ rigid) * (-1 if y_up else 1)
     width = rigid - np.outer(toward, toward @ rigid)

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.aimed import Aimed, towards
 from pliant.solver.cameras.factorization import upgrades
 from pliant.solver.cameras.multistart import CANDIDATES
-from pliant.solver.cameras.perspective import Perspective, centred, columns, corrected, depths_of
+from pliant.solver.cameras.perspective import Perspective, corrected, depths_of
 from pliant.solver.model.so3 import MIRROR, nearest
 from pliant.solver.records import Floats
 from pliant.solver.refinement.focal_length import refine_with_focal
 from pliant.solver.refinement.learned import Learned, Refinement
 from pliant.solver.tracks.frame_selection import evenly_spread
+from pliant.solver.tracks.matrix import centred, columns
 
 ALTERNATION_ROUNDS = 3
 """Updates of depths, covariance, cameras and κ each time that cameras were found or refined."""

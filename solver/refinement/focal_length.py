@@ -27,8 +27,6 @@ from pliant.solver.cameras.aimed import Aimed, towards
 from pliant.solver.cameras.perspective import (
     Candidate,
     Perspective,
-    centred,
-    columns,
     corrected,
     density,
     depths_of,
@@ -39,6 +37,7 @@ from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.records import Floats
 from pliant.solver.refinement.learned import Learned, Refinement, motion_of, moved_to, scene_at, to_all_frames
 from pliant.solver.tracks.frame_selection import evenly_spread
+from pliant.solver.tracks.matrix import centred, columns
 from scipy.optimize import minimize
 
 CURVATURES = (0.02, 0.035, 0.06, 0.1, 0.16, 0.25, 0.38)

@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.perspective import centred, columns
 from pliant.solver.model.expectation_maximisation import annealed, learned
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, fit, metric_of, root_of
 from pliant.solver.model.model_order import ModelOrder
@@ -15,6 +14,7 @@ from pliant.solver.model.shape_covariance import AXIS_VARIANCE_FLOOR, NOISE_VARI
 from pliant.solver.model.so3 import exponential, logarithm
 from pliant.solver.records import Floats
 from pliant.solver.tracks.frame_selection import between
+from pliant.solver.tracks.matrix import centred, columns
 
 REFINEMENT_PRIOR_WEIGHT = 0.01
 """Weight of the camera-motion prior: less is needed once the covariance is known."""

@@ -20,6 +20,7 @@ from pliant.solver.model.observation_model import ImageDensity, inlier_probabili
 from pliant.solver.records import Floats
 from pliant.solver.refinement.learned import START_EM_ROUNDS, Learned, Refinement
 from pliant.solver.tracks.completion import often_visible
+from pliant.solver.tracks.matrix import columns, points_of
 from pliant.solver.tracks.normalization import Normalized
 
 ROUNDS = 3
@@ -114,7 +115,7 @@ def cross_fitted(
     found, shares = np.zeros(observed.confidence.shape), []
     for fold in range(FOLDS):
         others, own = estimate.sample[used][:, part != fold], part == fold
-        rows = others.transpose(0, 2, 1).reshape(2 * len(used), -1)
+        rows = columns(others)
         covariance = learned(
             rows @ rows.T / rows.shape[1], projections, iterations=START_EM_ROUNDS, ordered=estimate.ordered, should_stop=should_stop
         )  # fmt: skip
@@ -176,7 +177,7 @@ def _expected(observed: Observed, found: Learned, before: Moments, start_scales:
     frames, count = points.shape[:2]
     moved = middle.reshape(frames, 2) * start_scales[:, None]
     return Moments(
-        (means @ means.T + covariance) / count, means.reshape(frames, 2, count).transpose(0, 2, 1),
+        (means @ means.T + covariance) / count, points_of(means),
         before.translations + moved, share,
     )  # fmt: skip
 
@@ -188,6 +189,6 @@ def _corrected(observed: Observed, found: Learned, before: Moments, start_scales
         return observed.points
     complete = before.sample * start_scales[:, None, None]
     depth = depth_map(found.rotations, found.scales * start_scales, found.covariance)
-    depths = depth @ complete.transpose(0, 2, 1).reshape(2 * len(complete), -1)
+    depths = depth @ columns(complete)
     depths -= depths[:, observed.often].mean(axis=1, keepdims=True)
     return corrected(observed.points + view.offsets[:, None], depths, view.curvature) - view.offsets[:, None]

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.perspective import centred, columns, depth_map
+from pliant.solver.cameras.perspective import depth_map
 from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.model.early_stopping import Schedule, schedule
 from pliant.solver.model.expectation_maximisation import improve
@@ -33,7 +33,9 @@ from pliant.solver.model.observation_model import ImageDensity
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 from pliant.solver.refinement.learned import Learned, motion_of, moved_to, scene_at
+from pliant.solver.shapes.uncertainty import distant_paths
 from pliant.solver.tracks.frame_selection import between, evenly_spread
+from pliant.solver.tracks.matrix import centred, columns, points_of
 from scipy.spatial import cKDTree
 
 PARTS = 6
@@ -126,7 +128,7 @@ def learning_changes(
         return nothing
     every, without = np.ones(sample.points.shape[1], dtype=bool), []
     try:
-        points = _points_of(sample.expected(start, every)[0])
+        points = points_of(sample.expected(start, every)[0])
         order = ModelOrder(ordered=covariance.ordered)
         early = schedule(points, _projections(start), order, seed=seed, should_stop=should_stop)
         part_of, everything = parts(points), _shapes_from(sample, every, start, early, turning)
@@ -171,11 +173,7 @@ def parts(sample: Floats) -> NDArray[np.intp]:
     """Return the index of the compact part of each point of `sample (F, S, 2)`: k-means of paths, starting from distant ones."""
     paths = sample.transpose(1, 0, 2).reshape(sample.shape[1], -1)
     first = int(np.square(paths - paths.mean(axis=0)).sum(axis=1).argmax())
-    middles, nearest = [paths[first]], np.square(paths - paths[first]).sum(axis=1)
-    while len(middles) < min(PARTS, len(paths)):
-        middles.append(paths[int(nearest.argmax())])
-        nearest = np.minimum(nearest, np.square(paths - middles[-1]).sum(axis=1))
-    centres = np.stack(middles)
+    centres = paths[distant_paths(paths, first, PARTS)[0]]
     for _ in range(CLUSTERING):
         part_of = cKDTree(centres).query(paths)[1]
         centres = np.stack(
@@ -215,16 +213,11 @@ def _shapes_from(
             found = relearned(found)
     means, _ = sample.expected(found, np.ones(kept.shape, dtype=bool))
     depths = depth_map(found.rotations, found.scales, found.covariance) @ means
-    return np.concatenate([_points_of(means), depths[..., None]], axis=2)
+    return np.concatenate([points_of(means), depths[..., None]], axis=2)
 
 
 def _projections(found: Learned) -> Floats:
     return np.asarray(found.rotations[:, :2] * found.scales[:, None, None])
-
-
-def _points_of(rows: Floats) -> Floats:
-    """Return the points `(F, P, 2)` of rows `(2F, P)`."""
-    return rows.reshape(-1, 2, rows.shape[1]).transpose(0, 2, 1)
 
 
 def _onto(shapes: Floats, others: Floats) -> Floats:

@@ -122,7 +122,7 @@ def position_std(
     frames = len(projections)
     used = evenly_spread(frames, MAX_POSTERIOR_FRAMES)
     noise, weights = noise_std**2, confidence[used]
-    nearest, chosen = _representatives(pinhole, used, confidence.shape[1])
+    chosen, nearest = _representatives(pinhole, used, confidence.shape[1])
     moments = [_moments(covariance, _rows(projections, pinhole, point), used) for point in chosen]
     complete = np.stack([_variance(*each, np.ones(len(used)), noise) for each in moments], axis=1)
     found, shown = complete[:, nearest], (weights > 0).any(axis=0)
@@ -144,22 +144,29 @@ def _rows(projections: Floats, pinhole: Pinhole | None, point: int) -> Floats:
 def _representatives(
     pinhole: Pinhole | None, used: NDArray[np.intp], count: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return which representative supplies the derivative of each point, and the representatives' point indices.
+    """Return the representatives' point indices, and which of them supplies the derivative of each point.
 
-    Under orthography all points have the same derivative. Otherwise representatives with distant image paths are chosen (Gonzalez 1985).
+    Under orthography all points have the same derivative. Otherwise representatives have distant image paths.
     """
     if pinhole is None:
-        return np.zeros(count, dtype=np.intp), np.zeros(1, dtype=np.intp)
+        return np.zeros(1, dtype=np.intp), np.zeros(count, dtype=np.intp)
     paths = pinhole.views[used].transpose(1, 0, 2).reshape(count, -1)
-    distance = np.square(paths - paths.mean(axis=0)).sum(axis=1)
-    chosen, nearest = [int(distance.argmin())], np.zeros(count, dtype=np.intp)
-    distance = np.square(paths - paths[chosen[0]]).sum(axis=1)
-    while len(chosen) < min(REPRESENTATIVES, count):
+    return distant_paths(paths, int(np.square(paths - paths.mean(axis=0)).sum(axis=1).argmin()), REPRESENTATIVES)
+
+
+def distant_paths(paths: Floats, first: int, limit: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Choose at most `limit` distant points by farthest-point sampling (Gonzalez 1985), given paths `(P, d)` and the first index.
+
+    Returns the indices of the points chosen, and the number of the nearest of them for every point.
+    """
+    chosen, nearest = [first], np.zeros(len(paths), dtype=np.intp)
+    distance = np.square(paths - paths[first]).sum(axis=1)
+    while len(chosen) < min(limit, len(paths)):
         chosen.append(int(distance.argmax()))
         to_new = np.square(paths - paths[chosen[-1]]).sum(axis=1)
         nearest = np.where(to_new < distance, len(chosen) - 1, nearest)
         distance = np.minimum(distance, to_new)
-    return nearest, np.array(chosen)
+    return np.array(chosen), nearest
 
 
 def bounded_by_neighbours(std: Floats, shapes: Floats, visible: Floats) -> Floats:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pliant.solver.agreement import check_seen
 from pliant.solver.records import Floats
 from pliant.solver.threads import SMALLEST, over_ranges
+from pliant.solver.tracks.matrix import centred, columns
 from pliant.solver.tracks.noise import RAYLEIGH_MEDIAN, weighted_median
 from pliant.solver.tracks.normalization import Normalized
 
@@ -366,7 +367,7 @@ def _carry(
         inside = np.isin(places, chosen, assume_unique=True)
         sample[:, np.isin(chosen, places, assume_unique=True)] = points[:, inside]
         points = points[:, often[places]]
-        stacked = points.transpose(0, 2, 1).reshape(2 * frames, -1)
+        stacked = columns(points)
         gram += stacked @ stacked.T
         total += points.sum(axis=1)
         used += points.shape[1]
@@ -398,7 +399,7 @@ def _widen(basis: Floats, points: Floats, weight: Floats, start: Floats, rank: i
         scale = max(_typical(_lengths(left), weight), MIN_RESIDUAL_SCALE)
         left *= (weight / (1 + (_lengths(left) / (3 * scale)) ** 2))[..., None]
         old, shift = basis[:, :, :-1], basis[:, :, -1]
-    stacked = (left - left.mean(axis=1, keepdims=True)).transpose(0, 2, 1).reshape(2 * frames, -1)
+    stacked = columns(centred(left))
     vectors = _leading(stacked, rank - 1 - old.shape[2])
     new = vectors.reshape(frames, 2, -1)
     return np.concatenate([old, new, shift[..., None]], axis=2)

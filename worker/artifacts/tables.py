@@ -9,8 +9,9 @@ from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.evaluation.alignment import centred, frobenius
+from pliant.solver.evaluation.alignment import frobenius
 from pliant.solver.evaluation.metrics import frame_errors
+from pliant.solver.tracks.matrix import centred
 from pliant.worker.artifacts.geometry import Floats
 from pliant.worker.artifacts.result import Result
 

@@ -7,12 +7,13 @@ import pytest
 from pliant.solver import KnownCamera, Settings, Tracks, gallery, solve
 from pliant.solver.cameras import perspective
 from pliant.solver.cameras.aimed import Aimed, towards
-from pliant.solver.cameras.perspective import centred, columns, corrected
+from pliant.solver.cameras.perspective import corrected
 from pliant.solver.evaluation.metrics import e3d_frame_scaled, focal_error
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR, exponential
 from pliant.solver.refinement.focal_length import CorrectedEnergy
 from pliant.solver.refinement.learned import Learned, motion_of
+from pliant.solver.tracks.matrix import centred, columns
 
 FRAMES, POINTS = 5, 30
 CURVATURES = pytest.mark.parametrize("curvature", [0.25, -0.25])

@@ -10,7 +10,6 @@ from pliant.solver.cameras import estimation, multistart
 from pliant.solver.cameras.estimation import estimate_cameras, given_cameras
 from pliant.solver.cameras.factorization import upgrade, upgrades
 from pliant.solver.cameras.multistart import carried
-from pliant.solver.cameras.perspective import columns
 from pliant.solver.model.camera_motion_prior import (
     SCALE_FLOOR,
     STEADY,
@@ -26,6 +25,7 @@ from pliant.solver.model.so3 import (
     start_at_identity,
 )
 from pliant.solver.tracks.completion import RANKS, complete, often_visible, spans
+from pliant.solver.tracks.matrix import columns
 from pliant.solver.tracks.normalization import normalize
 
 

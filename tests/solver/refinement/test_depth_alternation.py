@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pliant.solver import Settings, Tracks, gallery, solve
-from pliant.solver.cameras.perspective import MIRROR, Perspective, centred, columns, depth_map
+from pliant.solver.cameras.perspective import MIRROR, Perspective, depth_map
 from pliant.solver.evaluation.metrics import e3d_frame_scaled
 from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.refinement import depth_rounds
 from pliant.solver.refinement.depth_alternation import aligned, alternate, refactorize
 from pliant.solver.refinement.learned import Learned, Refinement
+from pliant.solver.tracks.matrix import centred, columns
 
 PICTURE = (1280.0, 720.0)
 

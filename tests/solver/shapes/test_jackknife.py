@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.perspective import centred, columns, depth_map
+from pliant.solver.cameras.perspective import depth_map
 from pliant.solver.model.early_stopping import learn_with_early_stopping
 from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 from pliant.solver.shapes.jackknife import MIN_LEARNED_POINTS, PARTS, learning_changes, parts
+from pliant.solver.tracks.matrix import centred, columns
 from scipy.spatial.transform import Rotation
 
 FRAMES = 12
