@@ -219,22 +219,11 @@ def _fit_patches(points: Floats, seen: NDArray[np.bool_], patches: Indices) -> t
     image = np.where(known[..., None], image - middle, 0.0)
     radius = np.linalg.norm(image, axis=3)
     size = float(np.median(radius[known])) or float(radius.max()) or 1.0  # the median is 0 if most points coincide
-    clipped = image * np.minimum(1.0, 3 * size / np.maximum(radius, 1e-12 * max(size, 1e-300)))[..., None]
-    stacked = clipped.transpose(0, 1, 3, 2).reshape(len(patches), -1, patches.shape[1])
-    right = np.linalg.svd(stacked, full_matrices=False)[2][:, :RANK]
-    shape, weight = right.transpose(0, 2, 1) * np.sqrt(patches.shape[1]), known / (1 + (radius / (3 * size)) ** 2) ** 2
-    noise = float(size)
-    motion = np.zeros((len(patches), len(points), RANK + 1, 2))
+    shape, weight = _starting_shapes(image, radius, size), known / (1 + (radius / (3 * size)) ** 2) ** 2
     for sweep in range(SWEEPS):
         pulse()
-        basis = np.concatenate([shape, np.ones((*shape.shape[:2], 1))], axis=2)
-        motion = _least_squares(np.einsum("nfq,nqa,nqb->nfab", weight, basis, basis, optimize=True),
-                                np.einsum("nfq,nqa,nfqc->nfac", weight, basis, image, optimize=True))  # fmt: skip
-        inner, shift = motion[:, :, :RANK], motion[:, :, RANK]
-        shape = _least_squares(
-            np.einsum("nfq,nfac,nfbc->nqab", weight, inner, inner, optimize=True),
-            np.einsum("nfq,nfac,nfqc->nqa", weight, inner, image - shift[:, :, None], optimize=True)[..., None],
-        )[..., 0]
+        inner, shift = _fit_motion(shape, weight, image)
+        shape = _fit_shapes(inner, weight, image - shift[:, :, None])
         off = np.linalg.norm(np.einsum("nqa,nfac->nfqc", shape, inner) + shift[:, :, None] - image, axis=3)
         noise = max(float(np.median(off[known])) / RAYLEIGH_MEDIAN, 1e-6 * float(size))
         scale = max(noise, ANNEALED ** (sweep + 1) * float(size))
@@ -243,6 +232,33 @@ def _fit_patches(points: Floats, seen: NDArray[np.bool_], patches: Indices) -> t
     fits = (known & (off <= GROSS * noise)).sum(axis=2)
     trusted = (fits >= RANK + 3) & (2 * fits >= known.sum(axis=2))
     return place.transpose(1, 0, 2), trusted.T, noise
+
+
+def _starting_shapes(image: Floats, radius: Floats, size: float) -> Floats:
+    """Return starting coordinates `(N, q, 2)` of patches from their centred images `(N, F, q, 2)`, clipped at 3 radii."""
+    clipped = image * np.minimum(1.0, 3 * size / np.maximum(radius, 1e-12 * max(size, 1e-300)))[..., None]
+    count = image.shape[2]
+    stacked = clipped.transpose(0, 1, 3, 2).reshape(len(image), -1, count)
+    right = np.linalg.svd(stacked, full_matrices=False)[2][:, :RANK]
+    return np.asarray(right.transpose(0, 2, 1) * np.sqrt(count))
+
+
+def _fit_motion(shape: Floats, weight: Floats, image: Floats) -> tuple[Floats, Floats]:
+    """Return M, shape `(N, F, 2, 2)`, and c, shape `(N, F, 2)`, of every patch and frame."""
+    basis = np.concatenate([shape, np.ones((*shape.shape[:2], 1))], axis=2)
+    motion = _least_squares(
+        np.einsum("nfq,nqa,nqb->nfab", weight, basis, basis, optimize=True),
+        np.einsum("nfq,nqa,nfqc->nfac", weight, basis, image, optimize=True),
+    )
+    return motion[:, :, :RANK], motion[:, :, RANK]
+
+
+def _fit_shapes(inner: Floats, weight: Floats, image: Floats) -> Floats:
+    """Return the coordinates b, shape `(N, q, 2)`, for given M and images minus c."""
+    return _least_squares(
+        np.einsum("nfq,nfac,nfbc->nqab", weight, inner, inner, optimize=True),
+        np.einsum("nfq,nfac,nfqc->nqa", weight, inner, image, optimize=True)[..., None],
+    )[..., 0]
 
 
 def _middle(image: Floats, known: NDArray[np.bool_]) -> Floats:

@@ -136,21 +136,36 @@ def isometric_surface(
     should_stop : callable, optional
         Called between units of work. If it returns True during the search, isometry is rejected; later, refinement ends early.
     """
-    seen, diagonal = tracks.visible > 0, _diagonal(tracks, image_size)
-    centre = _centre(tracks, principal_point, image_size)
-    part = _some_frames(tracks.points, seen)
-    search = _prepared(tracks.points[part], seen[part], centre, should_stop)
+    diagonal, centre = _diagonal(tracks, image_size), _centre(tracks, principal_point, image_size)
     first = focal if focal is not None else TYPICAL_FOCAL * diagonal
-    against = _implausible(search, first, required)
-    if against is None and len(part) < tracks.num_frames:
-        search = _prepared(tracks.points, seen, centre, should_stop)
-    if against is not None or search is None:
-        return IsometricVerdict(against or TOO_LITTLE)
+    search = _search(tracks, centre, first, required, should_stop)
+    if isinstance(search, str):
+        return IsometricVerdict(search)
     tried = sweep(search, first, diagonal, given=focal is not None)
     if search.stopped:
         return IsometricVerdict("Stopped before the test for isometry had finished.", _trace(tried))
     if not tried:
         return IsometricVerdict("No isometric surface was found: the conic program has no solution.", _trace(tried))
+    return _verdict(search, tracks, tried, focal, required)
+
+
+def _search(
+    tracks: Tracks, centre: Floats, focal: float, required: bool, should_stop: Callable[[], bool] | None
+) -> FocalSearch | str:
+    """Return the anchors of all frames, or the reason why dissimilar frames at one focal length exclude an isometric sheet."""
+    seen = tracks.visible > 0
+    part = _some_frames(tracks.points, seen)
+    search = _prepared(tracks.points[part], seen[part], centre, should_stop)
+    against = _implausible(search, focal, required)
+    if against is None and len(part) < tracks.num_frames:
+        search = _prepared(tracks.points, seen, centre, should_stop)
+    return against or search or TOO_LITTLE
+
+
+def _verdict(
+    search: FocalSearch, tracks: Tracks, tried: list[Tried], focal: float | None, required: bool
+) -> IsometricVerdict:
+    """Return the verdict on the surface at the given focal length, or at the best of those tried."""
     least = least_of(tried)
     judgement, chosen = judged(tried, least), least if focal is None else tried[0]
     supported, why = _confirmed(search, chosen, judgement) if judgement.ratio > 0 else (False, judgement.words)
@@ -160,7 +175,7 @@ def isometric_surface(
     warnings = _warnings(None if supported else why, focal, least, chosen)
     if not supported:
         why = f"Solved as an isometric sheet, as set, although {why}."
-    surface = _everywhere(search, tracks, seen, chosen)
+    surface = _everywhere(search, tracks, chosen)
     if surface is None:
         return IsometricVerdict("No isometric surface was found: its points are not connected.", _trace(tried))
     if not required and (rigid := _rigid(search, surface)) is not None:
@@ -266,7 +281,7 @@ def _glance(search: FocalSearch, focal: float) -> float:
     return refine(graph, depths, iterations=10).inconsistency if depths is not None else float("inf")
 
 
-def _everywhere(search: FocalSearch, tracks: Tracks, seen: NDArray[np.bool_], chosen: Tried) -> IsometricSurface | None:
+def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried) -> IsometricSurface | None:
     """Return the surface in all frames and points at the chosen focal length, or None if the anchors are not connected."""
     part = search.graph(chosen.focal, search.frames)
     whole = search.graph(chosen.focal)
@@ -287,7 +302,7 @@ def _everywhere(search: FocalSearch, tracks: Tracks, seen: NDArray[np.bool_], ch
         return None
     points, enough = complete_anchors(found.depths[..., None] * whole.rays, search.seen, template)
     all_of_it: Extended = extend(
-        tracks.points, seen, images=search.anchors.points, known=search.seen, anchors=points, template=template,
+        tracks.points, tracks.visible > 0, images=search.anchors.points, known=search.seen, anchors=points, template=template,
         focal=chosen.focal, centre=search.centre,
     )  # fmt: skip
     if not np.isfinite(all_of_it.points).all() or not enough.any():

@@ -65,23 +65,15 @@ def read_inputs(
     if rotations is not None:
         frames = chosen.selection.frames
         cameras = read_rotations(rotations, num_frames=len(understood.points), frames=frames, limits=limits)
-    checked = chosen.tracks
-    interpretation = Interpretation(
-        num_frames=checked.num_frames, num_points=checked.num_points,
-        num_faces=0 if chosen.mesh is None else len(chosen.mesh.faces),
-        hidden_fraction=float((checked.visible == 0).mean()),
-        mesh_source=chosen.source, mesh_grid=chosen.grid, has_ground_truth=truth is not None, has_rotations=cameras is not None,
-        layout=understood.layout, format=understood.format, coordinates=understood.coordinates, y_axis=understood.y_axis,
-        given_frames=understood.points.shape[0], given_points=understood.points.shape[1],
-        num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(),
-        notes=[
-            *notes_on_options(options, film=False), *understood.notes,
-            *unused_arrays(tracks, understood, has_mesh=mesh is not None, has_truth=truth is not None),
-            *chosen.notes, *truth_notes,
-        ],
-        **({} if film is None else _stated(film, chosen.selection)),
-    )  # fmt: skip
-    known = tracks_options(options, interpretation)
+    notes = [
+        *notes_on_options(options, film=False), *understood.notes,
+        *unused_arrays(tracks, understood, has_mesh=mesh is not None, has_truth=truth is not None),
+        *chosen.notes, *truth_notes,
+    ]  # fmt: skip
+    interpretation = _interpretation(
+        understood, chosen, film, notes, has_truth=truth is not None, has_rotations=cameras is not None
+    )
+    checked, known = chosen.tracks, tracks_options(options, interpretation)
     check_seen(checked.visible)
     check_options(checked, chosen.mesh, cameras, known, y_axis=understood.y_axis)
     estimate = estimated(checked.num_frames, checked.num_points, known, has_rotations=cameras is not None)
@@ -145,6 +137,29 @@ def unused_arrays(path: Path, understood: Understood, *, has_mesh: bool, has_tru
         + (" Send a mesh as the part mesh." if mesh else "")
         + (" Send given cameras as the part rotations." if cameras else "")
     ]
+
+
+def _interpretation(
+    understood: Understood,
+    chosen: _Chosen,
+    film: FilmTracks | None,
+    notes: list[str],
+    *,
+    has_truth: bool,
+    has_rotations: bool,
+) -> Interpretation:
+    """Return how the files were understood, without the estimated cost."""
+    tracks, (frames, points) = chosen.tracks, understood.points.shape[:2]
+    return Interpretation(
+        num_frames=tracks.num_frames, num_points=tracks.num_points,
+        num_faces=0 if chosen.mesh is None else len(chosen.mesh.faces),
+        hidden_fraction=float((tracks.visible == 0).mean()),
+        mesh_source=chosen.source, mesh_grid=chosen.grid, has_ground_truth=has_truth, has_rotations=has_rotations,
+        layout=understood.layout, format=understood.format, coordinates=understood.coordinates, y_axis=understood.y_axis,
+        given_frames=frames, given_points=points,
+        num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(), notes=notes,
+        **({} if film is None else _stated(film, chosen.selection)),
+    )  # fmt: skip
 
 
 def _stated(film: FilmTracks, selection: Selection) -> dict[str, Any]:
