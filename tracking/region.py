@@ -90,8 +90,9 @@ def transport(
 ) -> Bools:
     """Carry a region `(H, W)` from one frame to another and return its mask there.
 
-    The grid's points are carried directly from the start and, in steps, from frame to frame; the more certain result is taken, as in
-    `chaining`. The mask is the union of the faces whose corners are all visible, closed over one grid step.
+    The grid's points are carried directly from the start and in steps of at most `LONG_STEP` frames. Of two visible results, the one with
+    the smaller sum of squared cycle errors is taken; unlike in `chaining`, steps add no variance of their own. The mask is the union of the
+    faces whose corners are all visible, closed over one grid step.
     """
     points, seen = seeds.points, np.ones(len(seeds.points), dtype=bool)
     variance = np.zeros(len(points), dtype=np.float32)

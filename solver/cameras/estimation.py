@@ -73,7 +73,8 @@ class CameraEstimate:
     """K of the factorization; 0 for given cameras."""
 
     gram: Floats
-    """W Wᵀ / P of the completed tracks, shape `(2F, 2F)`, normalized units squared; empty if not needed."""
+    """W Wᵀ / P of the completed tracks, shape `(2F, 2F)`, normalized units squared; empty if not needed. In long films that of the F'
+    frames learned from, shape `(2F', 2F')`."""
 
     sample: Floats
     """Sampled points of the completed tracks, centred, shape `(F, S, 2)`, normalized units; empty if not needed."""

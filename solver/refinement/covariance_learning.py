@@ -21,7 +21,7 @@ class LearningData:
     """Data from which the shape covariance is learned, once the cameras are final."""
 
     gram: Floats
-    """Gram matrix of the frames used, divided by the starting scales, shape `(2F', 2F')`."""
+    """Gram matrix of the frames used, divided by the starting scales, shape `(2F', 2F')`; empty for all frames of a long film."""
 
     sample: Floats
     """Sampled points, divided by the same scales, shape `(F', S, 2)`."""

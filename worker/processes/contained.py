@@ -33,7 +33,7 @@ ERRORS_KEPT = 4096
 """Maximum bytes of standard error that the parent reads."""
 
 MAX_LINE = 4096
-"""Maximum bytes of a line of progress; longer lines are dropped."""
+"""Maximum bytes kept of a line of progress that has not ended yet; a longer one is dropped."""
 
 POLL = 0.1
 """Seconds between two calls of `should_stop`."""

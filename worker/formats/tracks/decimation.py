@@ -1,11 +1,14 @@
-"""Choose fewer points, spread evenly, and their mesh: every n-th row and column of a grid, or clusters of a mesh's vertices.
+"""Choose fewer points and their mesh: every n-th row and column of a grid, or clusters of a mesh's vertices.
+
+Without a mesh, every n-th point is kept, or as many as allowed, spread evenly over the picture.
 
 A mesh is thinned by a centroidal Voronoi diagram on its edges (the idea of Valette and Chassery, Approximated centroidal Voronoi diagrams
 for uniform polygonal mesh coarsening, 2004): seeds are spread over the picture, every vertex is assigned to the seed nearest along the
-edges, and each seed moves to the centre of its cluster. Two clusters are neighbours if an edge of the mesh joins them, so the new faces are
-the triangles of the mesh whose corners lie in three clusters. The kept points are the seeds: tracks of the input, unchanged and in the
-input's order, never averages. An edge is as long as its maximum length in the picture over the frames, the best 2-D estimate of its length
-on the surface.
+edges, and each seed moves to the vertex farthest from other clusters, preferring those seen often. Two clusters are neighbours if an edge
+of the mesh joins them, so the new faces are the triangles of the mesh whose corners lie in three clusters. The kept points are the seeds,
+without those in no face unless fewer than `MIN_POINTS` would remain: tracks of the input, unchanged and in the input's order, never
+averages. An edge is as long as its maximum length in the picture over `MEASURED_FRAMES` frames, the best 2-D estimate of its length on the
+surface.
 """
 
 from __future__ import annotations
@@ -37,8 +40,8 @@ def thin(
 ) -> tuple[Indices, Mesh | None, list[str]]:
     """Choose points by the options `stride` and `max_points`.
 
-    Points are `(F, P, 2)`, NaN where hidden, of the selected frames. Returns the increasing indices of the kept points, their
-    mesh, None if it is still to be generated, and notes.
+    Points are `(F, P, 2)` of the selected frames; hidden ones are NaN or have 0 in `visible (F, P)`. Returns the increasing indices of the
+    kept points, their mesh, None if it is still to be generated, and notes.
 
     Raises
     ------
