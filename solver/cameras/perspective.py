@@ -108,9 +108,9 @@ class Perspective:
     filling: Filling | None = None
     """How hidden entries are completed; None if there are none."""
 
-    visible_sample: Floats = field(default_factory=lambda: np.zeros((0, 0, 2)))
-    """Complete tracks, uncorrected, of the sampled points that are often visible, relative to the principal point, shape `(F, S', 2)`,
-    normalized units."""
+    learning_sample: Floats = field(default_factory=lambda: np.zeros((0, 0, 2)))
+    """Complete, uncorrected tracks from which κ is learned, those of sampled points that are hidden only briefly, relative to the principal
+    point, shape `(F, S', 2)`, normalized units."""
 
     full_sample: Floats = field(default_factory=lambda: np.zeros((0, 0, 2)))
     """The same of all sampled points, shape `(F, S, 2)`."""
@@ -179,7 +179,7 @@ def mean_depth(view: Perspective) -> Floats:
     Scales and κ are learned from the sample. With the mean of all points as origin, which differs in depth, the errors at 3, 5 and 10
     half-sizes are 1.06 to 1.18 times as large for face scans and a speaking head, .99 times for a horse (1,000 points).
     """
-    images = _corrected_by(view, view.visible_sample)
+    images = _corrected_by(view, view.learning_sample)
     return np.asarray(view.depth @ columns(images.mean(axis=1, keepdims=True)))
 
 

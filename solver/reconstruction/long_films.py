@@ -194,6 +194,6 @@ def _perspective(
         return view
     view = replace(view, offsets=lens.offsets, filling=filling)
     if not view.bends:
-        return replace(view, visible_sample=np.zeros((0, 0, 2)))
+        return replace(view, learning_sample=np.zeros((0, 0, 2)))
     seen = _filled(views, shapes, poses, as_seen=True)
-    return replace(view, visible_sample=seen, depth=depth_map(rotations, scales, covariance))
+    return replace(view, learning_sample=seen, depth=depth_map(rotations, scales, covariance))

@@ -55,7 +55,7 @@ def alternate(
     rounds : int
         Maximum number of rounds.
     """
-    views = view.visible_sample[used]
+    views = view.learning_sample[used]
     for _ in range(rounds):
         if how.stopped():
             break
@@ -101,10 +101,10 @@ def refactorize(
         moved, _ = alternate(view, start, some, replace(how, should_stop=None), rounds=1)
         return moved.energy
 
-    turns = towards(view.visible_sample.mean(axis=1), view.curvature)
+    turns = towards(view.learning_sample.mean(axis=1), view.curvature)
     rows = columns(_turned(view, turns) / scales[:, None, None])
     gram = rows @ rows.T / rows.shape[1]
-    limit = min(len(gram) // 3, view.visible_sample.shape[1] // 3)
+    limit = min(len(gram) // 3, view.learning_sample.shape[1] // 3)
     best, lowest = None, energy(part)
     for each in upgrades(gram, [size for size in CANDIDATES if size <= limit]):
         if how.stopped():
@@ -118,8 +118,8 @@ def refactorize(
 
 def _turned(view: Perspective, turns: Floats) -> Floats:
     """Return the corrected and centred tracks of the sample, `(F, S, 2)`, seen by turned cameras."""
-    depths = depths_of(view.depth, view.visible_sample, view.curvature)
-    images = centred(corrected(view.visible_sample, depths, view.curvature))
+    depths = depths_of(view.depth, view.learning_sample, view.curvature)
+    images = centred(corrected(view.learning_sample, depths, view.curvature))
     depths -= depths.mean(axis=1, keepdims=True)
     return np.asarray(images @ turns[:, :2, :2].transpose(0, 2, 1) + depths[..., None] * turns[:, None, :2, 2])
 

@@ -42,9 +42,9 @@ def correct_perspective(evidence: Evidence, how: Refinement) -> Evidence:
     sample = estimate.sample + (estimate.perspective.offsets + estimate.translations)[:, None]
     briefly = briefly_hidden(evidence.normalized.visible)[estimate.sampled]
     view = replace(
-        estimate.perspective, filling=estimate.filling, visible_sample=sample[:, briefly], full_sample=sample
+        estimate.perspective, filling=estimate.filling, learning_sample=sample[:, briefly], full_sample=sample
     )
-    cameras = view.visible_sample[used], evidence.rotations, evidence.start_scales[used]
+    cameras = view.learning_sample[used], evidence.rotations, evidence.start_scales[used]
     view, found = search(*cameras, view, how)
     if not view.bends:
         return replace(evidence, estimate=replace(estimate, perspective=view))

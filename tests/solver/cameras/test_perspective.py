@@ -86,7 +86,7 @@ def test_corrected_tracks_do_not_depend_on_the_size_of_chunks(chunk: int, monkey
     offsets = (normalized.centroid - CENTRE) / normalized.unit
     sample = normalized.points[:, ::3] + offsets[:, None]
     view = Perspective(
-        offsets, CENTRE, curvature=normalized.unit / FOCAL, visible_sample=sample, full_sample=sample,
+        offsets, CENTRE, curvature=normalized.unit / FOCAL, learning_sample=sample, full_sample=sample,
         depth=depth_map(FACE.rotations, np.ones(len(SEEN)), covariance),
     )  # fmt: skip
     assert normalized.points.shape[1] < completion.POINTS_PER_CHUNK
@@ -97,7 +97,7 @@ def test_corrected_tracks_do_not_depend_on_the_size_of_chunks(chunk: int, monkey
     other, moved, _ = corrected_moments(view, normalized)
     assert other == pytest.approx(gram, abs=1e-12)
     assert moved == pytest.approx(middle, abs=1e-12)
-    assert depths[:, ::3] == pytest.approx(depths_of(view.depth, view.visible_sample, view.curvature), abs=1e-3)
+    assert depths[:, ::3] == pytest.approx(depths_of(view.depth, view.learning_sample, view.curvature), abs=1e-3)
 
 
 @pytest.mark.parametrize("y_up", [False, True])

@@ -31,7 +31,7 @@ def hinge() -> tuple[Floats, Perspective]:
     seen = shapes @ rotations.transpose(0, 2, 1)
     seen /= np.sqrt(np.square(seen[..., :2]).sum(axis=2).mean())
     views = seen[..., :2] / (1 + CURVATURE * seen[..., 2:])
-    return rotations, Perspective(np.zeros((FRAMES, 2)), np.zeros(2), visible_sample=views, candidates=ANY)
+    return rotations, Perspective(np.zeros((FRAMES, 2)), np.zeros(2), learning_sample=views, candidates=ANY)
 
 
 def cameras_off(rotations: Floats, degrees: float) -> Floats:
@@ -45,7 +45,7 @@ def test_cameras_and_sign_of_depth_follow_from_the_tracks(
 ) -> None:
     rotations, view = hinge
     start = cameras_off(rotations, 15.0)
-    found = affine_iterations(view.visible_sample, start, np.ones(FRAMES), replace(view, given=given), Refinement())
+    found = affine_iterations(view.learning_sample, start, np.ones(FRAMES), replace(view, given=given), Refinement())
     assert found is not None
     learned, curvature = found
     assert curvature == given if given is not None else 0.5 < curvature / CURVATURE < 2
@@ -57,7 +57,7 @@ def test_cameras_and_sign_of_depth_follow_from_the_tracks(
 def test_the_result_hardly_depends_on_the_other_cameras(hinge: tuple[Floats, Perspective]) -> None:
     rotations, view = hinge
     one, two = (
-        affine_iterations(view.visible_sample, cameras_off(rotations, degrees), np.ones(FRAMES), view, Refinement())
+        affine_iterations(view.learning_sample, cameras_off(rotations, degrees), np.ones(FRAMES), view, Refinement())
         for degrees in (0.0, 15.0)
     )
     assert one is not None
@@ -71,18 +71,18 @@ def test_the_result_hardly_depends_on_the_other_cameras(hinge: tuple[Floats, Per
 def test_a_more_probable_search_is_kept(hinge: tuple[Floats, Perspective]) -> None:
     rotations, view = hinge
     better = replace(view, curvature=0.1, candidates=(Candidate(0.1, -np.inf),))
-    assert affine_iterations(view.visible_sample, rotations, np.ones(FRAMES), better, Refinement()) is None
+    assert affine_iterations(view.learning_sample, rotations, np.ones(FRAMES), better, Refinement()) is None
 
 
 def test_a_stop_ends_the_iterations(hinge: tuple[Floats, Perspective]) -> None:
     rotations, view = hinge
     found = affine_iterations(
-        view.visible_sample, rotations, np.ones(FRAMES), view, Refinement(should_stop=lambda: True)
+        view.learning_sample, rotations, np.ones(FRAMES), view, Refinement(should_stop=lambda: True)
     )
     assert found is None
 
 
 def test_too_few_points_for_any_factorization_have_no_result(hinge: tuple[Floats, Perspective]) -> None:
     rotations, view = hinge
-    few = view.visible_sample[:, :5]
+    few = view.learning_sample[:, :5]
     assert affine_iterations(few, rotations, np.ones(FRAMES), view, Refinement()) is None

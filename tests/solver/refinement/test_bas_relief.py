@@ -176,7 +176,7 @@ def test_perspective_is_the_same_at_twice_the_depth_and_twice_the_focal_length(m
     twice = with_stretched_depth(evidence, moved, 2.0).estimate
     assert twice.perspective is not None
     assert twice.perspective.curvature == 0.02
-    view = deep.perspective.visible_sample
+    view = deep.perspective.learning_sample
     bent = (plain.sample - view + view.mean(axis=1, keepdims=True)).std()
     assert bent > 0.005
     assert (twice.sample - plain.sample).std() < 0.1 * bent
