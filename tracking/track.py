@@ -192,7 +192,8 @@ def _assemble(
     rows = slice(plan.start, plan.stop)
     width, height = run.film.size
     indices, times = found.indices[rows], found.times[rows]
-    visible, confidence = chained.visible[:, kept], chained.confidence[:, kept]
+    visible, variance, confidence = chained.visible[:, kept], chained.variance[:, kept], chained.confidence[:, kept]
+    placed = chained.visible.shape[1]
     for points in chained.points:
         points[: len(kept)] = _in_film(points[kept], found.scale)
     tracks = chained.points[:, : len(kept)]
@@ -206,7 +207,7 @@ def _assemble(
         indices, times, tuple(int(found.indices[row]) for row in found.cuts),
     )  # fmt: skip
     uv = ((tracks[template] + 0.5) / np.array([width, height])).astype(np.float32)
-    warnings = (*notes, *warnings_of(tracks, visible, template))
+    warnings = (*notes, *warnings_of(tracks, visible, variance, template, placed=placed, least_seen=LEAST_SEEN))
     return TrackedFilm(
         info, tracks, visible, confidence, grid, quads(grid), template, image, uv, thumbnails, view, picked, warnings
     )

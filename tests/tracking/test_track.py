@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from pliant.solver.gallery import face, flag, sphere
 from pliant.tracking import FilmError, TrackedFilm, TrackingStep, TrackingStopped, track_film
+from pliant.tracking.advice import warnings_of
 from pliant.tracking.contact_sheet import view_of
 from pliant.tracking.rendering import RenderedFilm
 
@@ -247,6 +248,44 @@ def test_a_still_film_gets_a_warning(tmp_path: Path) -> None:
         "Nothing moves in this film, so it holds no information about depth. Turn the object by 30° or more to both sides, "
         "or walk around it.",
     )
+
+
+@pytest.mark.parametrize(
+    ("deviation", "share", "placed", "expected"),
+    [
+        (1.4, 1.0, 20, []),
+        (1.6, 0.04, 20, []),
+        (
+            1.6,
+            0.5,
+            20,
+            ["In 50% of the visible positions, the picture fits the template poorly; these points may be off by"],
+        ),
+        (1.4, 1.0, 30, ["33% of the points were left out, because they are visible in less than 20% of the frames"]),
+    ],
+)
+def test_uncertain_positions_and_points_left_out_get_warnings(
+    deviation: float, share: float, placed: int, expected: list[str]
+) -> None:
+    random = np.random.default_rng(0)
+    tracks = random.uniform(0, 200, (10, 20, 2)).astype(np.float32)
+    visible, variance = np.ones((10, 20), bool), np.full((10, 20), 0.01, np.float32)
+    visible[:, -1] = False
+    variance[:, -1] = 100.0  # a hidden position may be uncertain
+    seen = np.flatnonzero(visible)
+    variance.flat[seen[: round(share * len(seen))]] = deviation**2
+    found = warnings_of(tracks, visible, variance, 0, placed=placed, least_seen=0.2)
+    assert [one[: len(begins)] for one, begins in zip(found, expected, strict=True)] == expected
+
+
+def test_parts_that_stay_hidden_are_counted_as_left_out(tmp_path: Path) -> None:
+    pictures, random = [picture.copy() for picture in films.textured_pictures(10, (96, 72))], np.random.default_rng(0)
+    for picture in pictures[1:]:
+        picture[:, 45:] = random.integers(0, 255, picture[:, 45:].shape, dtype=np.uint8)
+    path = films.write_film(tmp_path / "film.mkv", pictures)
+    tracked = track_film(path, region=[(10, 10), (86, 10), (86, 62), (10, 62)], region_frame=0)
+    (left_out,) = (one for one in tracked.warnings if "left out" in one)
+    assert 30 < int(left_out.split("%")[0]) < 80
 
 
 def test_a_film_of_three_frames_is_tracked_and_one_of_two_refused(tmp_path: Path) -> None:
