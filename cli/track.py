@@ -34,7 +34,10 @@ def track(
     ] = None,
     region_frame: Annotated[int, typer.Option("--region-frame", help="Frame that the mask was drawn on.", min=0)] = 0,
     template_frame: Annotated[
-        int | None, typer.Option("--template-frame", help="Frame whose points are followed.", min=0)
+        int | None,
+        typer.Option(
+            "--template-frame", help="Frame whose points are followed; by default a sharp one in the middle.", min=0
+        ),
     ] = None,
     frames: Annotated[
         str | None, typer.Option("--frames", help="Maximum number of frames, or start:stop:step, e.g. 0:300:2.")

@@ -92,10 +92,11 @@ def warnings_of(
     """
     notes = []
     size = float(np.hypot(*np.ptp(tracks[template], axis=0)))
-    moved = np.zeros(visible.shape[1])
+    lowest, highest = tracks[template].copy(), tracks[template].copy()
     for points, seen in zip(tracks, visible, strict=True):  # one frame at a time, to save memory
-        np.maximum(moved, np.linalg.norm(points - tracks[template], axis=1), out=moved, where=seen)
-    if np.median(moved) < STILL_SHARE * size:
+        np.minimum(lowest, points, out=lowest, where=seen[:, None])
+        np.maximum(highest, points, out=highest, where=seen[:, None])
+    if np.median(np.linalg.norm(highest - lowest, axis=1)) < STILL_SHARE * size:
         notes.append(
             "Nothing moves in this film, so it holds no information about depth. Turn the object by 30° or more to both sides, "
             "or walk around it."

@@ -16,7 +16,8 @@ from pliant.tracking.decoding.pictures import upright
 from pliant.tracking.errors import FilmError, TrackingStopped
 from pliant.tracking.flow import Bools, Floats, Grey, dense_flow, match
 from pliant.tracking.records import OnStep, TrackingStep
-from pliant.tracking.seeding import Seeds, neighbours, quads
+from pliant.tracking.seeding import Seeds, default_step, neighbours
+from scipy.spatial import cKDTree
 
 Region = NDArray[np.bool_] | NDArray[np.uint8] | Sequence[Sequence[float]] | Path | str
 
@@ -38,6 +39,10 @@ FARTHEST = 1e6
 
 LONG_STEP = 2
 """Frames per step when a region is carried to the template; longer steps lose fast motion."""
+
+REACH = 1.5
+"""Distance from the nearest visible point up to which a pixel of the region moves with it, in steps of the grid: just beyond the diagonal of
+a cell, so that the border of the region moves too."""
 
 
 def read_region(region: Region, size: tuple[int, int]) -> Bools:
@@ -91,8 +96,8 @@ def transport(
     """Carry a region `(H, W)` from one frame to another and return its mask there.
 
     The grid's points are carried directly from the start and in steps of at most `LONG_STEP` frames. Of two visible results, the one with
-    the smaller sum of squared cycle errors is taken; unlike in `chaining`, steps add no variance of their own. The mask is the union of the
-    faces whose corners are all visible, closed over one grid step.
+    the smaller sum of squared cycle errors is taken; unlike in `chaining`, steps add no variance of their own. Every pixel of the region
+    moves with the nearest visible point, if that is near, and gaps of one grid step are closed.
     """
     points, seen = seeds.points, np.ones(len(seeds.points), dtype=bool)
     variance = np.zeros(len(points), dtype=np.float32)
@@ -115,18 +120,22 @@ def transport(
         points = np.stack([m.points for m in found])[best, every]
         seen, variance = appearance.agrees(frame, points, sees[best, every]), sums[best, every]
         on_step(TrackingStep("locate", abs(here - start), abs(end - start)))
-    return _cover(points, seen, seeds, read(end).shape)
+    return _cover(region, seeds.points[seen], points[seen], default_step(region), read(end).shape)
 
 
-def _cover(points: Floats, seen: Bools, seeds: Seeds, shape: tuple[int, ...]) -> Bools:
-    """Fill the faces whose corners are all visible, and close gaps of one grid step."""
+def _cover(region: Bools, before: Floats, after: Floats, step: float, shape: tuple[int, ...]) -> Bools:
+    """Move the pixels of a region with the nearest of the points, from `before (N, 2)` to `after`, and close gaps of one grid step."""
     mask = np.zeros(shape, dtype=np.uint8)
-    faces = quads(seeds.grid)
-    corners = np.round(points[faces[seen[faces].all(axis=1)]]).astype(np.int32)
-    for corner in corners:
-        cv2.fillConvexPoly(mask, corner, 1)
-    step = int(np.ceil(np.abs(seeds.points[faces[:, 2]] - seeds.points[faces[:, 0]]).max())) if len(faces) else 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * step + 1, 2 * step + 1))
+    if len(before) == 0:
+        return mask > 0
+    pixels = np.argwhere(region)[:, ::-1]
+    distance, nearest = cKDTree(before).query(pixels)
+    near = distance <= REACH * step
+    x, y = np.round(pixels[near] + (after - before)[nearest[near]]).astype(np.int64).T
+    inside = (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
+    mask[y[inside], x[inside]] = 1
+    side = 2 * int(np.ceil(step)) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     return np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disc) > 0)
 
 

@@ -129,8 +129,14 @@ def find_cuts(likeness: NDArray[np.float64]) -> tuple[int, ...]:
 
 def sharpest(sharpness: NDArray[np.float64], start: int, stop: int) -> int:
     """Return the sharpest frame of the middle third of a shot."""
+    frames = middle_of(start, stop)
+    return frames.start + int(np.argmax(sharpness[frames.start : frames.stop]))
+
+
+def middle_of(start: int, stop: int) -> range:
+    """Return the middle third of a shot, at least one frame."""
     first, last = start + (stop - start) // 3, stop - (stop - start) // 3
-    return first + int(np.argmax(sharpness[first : max(last, first + 1)]))
+    return range(first, max(last, first + 1))
 
 
 def _thumbnail(grey: Grey) -> Grey:

@@ -242,7 +242,7 @@ def test_cancelling_stops_the_tracking(running: Running, http: httpx.Client, tmp
 
 
 def test_a_rerun_of_a_film_keeps_its_tracking_options(running: Running, http: httpx.Client, film: bytes) -> None:
-    corners = [[20, 20], [70, 20], [70, 55]]
+    corners = [[10, 15], [75, 15], [75, 60]]
     first = send(http, film, options={**QUICK, "region_polygon": corners, "frames": "0:8", "max_points": 30})
     assert work(running, first.id).status is Status.SUCCEEDED
     parts = {"inputs_of": (None, first.id), "options": (None, json.dumps({"loss": "l2", "frames": "0:6"}))}

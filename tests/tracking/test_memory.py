@@ -21,7 +21,7 @@ from pliant.tracking import track_film
 
 mask = np.zeros((120, 160), np.uint8)
 mask[20:100, 30:130] = 255
-tracked = track_film(sys.argv[1], region=mask, frames=f":{sys.argv[2]}", longest_side=160, grid_step=8, threads=1)
+tracked = track_film(sys.argv[1], region=mask, template_frame=0, frames=f":{sys.argv[2]}", longest_side=160, grid_step=8, threads=1)
 print(json.dumps({
     "frames": len(tracked.tracks), "points": tracked.tracks.shape[1], "visible": float(tracked.visibility.mean()),
     "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,

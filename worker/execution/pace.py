@@ -18,7 +18,7 @@ tracker threads run during the measurement; chosen on the film of `benchmarks.in
 class MachinePace:
     """Mean ratio of measured to planned time: 1 if stages take as long as planned, 2 if they take twice as long.
 
-    It scales plans of work that has not begun; during a solve, `pliant.solver.stages.Pace` is more accurate.
+    It scales plans of work that has not begun; during a solve, the pace of `pliant.solver.monitor` is more accurate.
     """
 
     def __init__(self) -> None:

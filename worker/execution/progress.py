@@ -91,7 +91,8 @@ class Reporter:
             left = self._known_left(part, done, seconds_left, now)
             if left is None:
                 self._furthest = max(self._furthest, low + (high - low) * done)
-                if self._furthest >= WORTH_ESTIMATING:
+                # Until a film's points are placed, nothing is known about the time of the solve.
+                if self._furthest >= WORTH_ESTIMATING and part != "track":
                     left = spent * (1 - self._furthest) / self._furthest
             else:
                 self._furthest = max(self._furthest, spent / (spent + left) if spent + left > 0 else 1.0)
