@@ -41,8 +41,8 @@ LONG_STEP = 2
 """Frames per step when a region is carried to the template; longer steps lose fast motion."""
 
 REACH = 1.5
-"""Distance from the nearest visible point up to which a pixel of the region moves with it, in steps of the grid: just beyond the diagonal of
-a cell, so that the border of the region moves too."""
+"""Distance from the nearest visible point up to which a pixel of the region moves with it, in steps of the grid: just beyond the diagonal
+of a cell, so that the border of the region moves too."""
 
 
 def read_region(region: Region, size: tuple[int, int]) -> Bools:
