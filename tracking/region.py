@@ -131,7 +131,8 @@ def _cover(region: Bools, before: Floats, after: Floats, step: float, shape: tup
     pixels = np.argwhere(region)[:, ::-1]
     distance, nearest = cKDTree(before).query(pixels)
     near = distance <= REACH * step
-    x, y = np.round(pixels[near] + (after - before)[nearest[near]]).astype(np.int64).T
+    moved = (after - before)[np.asarray(nearest)[near]]
+    x, y = np.round(pixels[near] + moved).astype(np.int64).T
     inside = (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
     mask[y[inside], x[inside]] = 1
     side = 2 * int(np.ceil(step)) + 1

@@ -313,7 +313,7 @@ def _model_signs(modes: int, frames: int, *, off: float | None, turn: float | No
         )
     if off is not None:
         found.append(
-            f"The object is nearly flat, {_percent(off)} of its size off its plane, so the motion hardly shows bending."
+            f"The tracked surface is nearly flat, {_percent(off)} of its size off its plane, so the motion hardly shows bending."
         )
     if turn is not None:
         found.append(

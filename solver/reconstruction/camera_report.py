@@ -72,7 +72,11 @@ def described(view: Perspective, unit: float) -> str:
     how = "as given" if view.given is not None else "" if std is None else f"± {float(f'{std:.2g}'):g}"
     gains = f"gains {nll[0.0] - own:.3f} in the log likelihood per point and frame over orthography"
     length = f"{unit / abs(view.curvature):.4g} {how}".strip()
-    return f"Perspective with focal length {length}: {gains if own < UNLIKELY else DIVERGED}."
+    if own >= UNLIKELY:
+        return f"Perspective with focal length {length}: {DIVERGED}."
+    if view.given is not None:
+        return f"Perspective with focal length {length}: {gains}."
+    return f"Perspective {gains}. The focal length, estimated together with cameras and covariance, is {length}."
 
 
 def improbable(view: Perspective, unit: float) -> str | None:

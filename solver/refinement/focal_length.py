@@ -286,8 +286,8 @@ def more_probable(view: Perspective) -> tuple[float, float] | None:
     return best, own - nll[best] if own < UNLIKELY else np.inf
 
 
-def unclear_perspective(view: Perspective) -> tuple[float, float] | None:
-    """Return κ and gain of the best perspective compared, if the tracks hardly distinguish it from orthography; None if they do.
+def unclear_perspective(view: Perspective) -> float | None:
+    """Return κ of the best perspective compared, if the tracks hardly distinguish it from orthography; None if they do.
 
     Values of κ below the smallest of the grid, where perspective makes no difference, do not count. Nor does a given focal length or
     camera model, about which the tracks were not asked.
@@ -297,8 +297,7 @@ def unclear_perspective(view: Perspective) -> tuple[float, float] | None:
     if view.given is not None or view.required or flat is None or not nll:
         return None
     best = min(nll, key=lambda each: nll[each])
-    gain = flat - nll[best]
-    return (best, gain) if UNCLEAR_GAINS[0] < gain < UNCLEAR_GAINS[1] else None
+    return best if UNCLEAR_GAINS[0] < flat - nll[best] < UNCLEAR_GAINS[1] else None
 
 
 def refine_with_focal(

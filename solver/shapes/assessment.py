@@ -15,7 +15,7 @@ from pliant.solver.evaluation.trust import Trust, assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.pulse import pulse
 from pliant.solver.records import Camera, Floats, Tracks
-from pliant.solver.refinement.focal_length import MIN_PERSPECTIVE_GAIN, more_probable, unclear_perspective
+from pliant.solver.refinement.focal_length import more_probable, unclear_perspective
 from pliant.solver.shapes.held_out import held_out_error
 from pliant.solver.shapes.jackknife import Changes, learning_changes
 from pliant.solver.shapes.uncertainty import Pinhole, bounded_by_neighbours, position_std
@@ -172,13 +172,14 @@ def _unclear_camera(view: Perspective | None, unit: float) -> str | None:
     found = None if view is None else unclear_perspective(view)
     if view is None or found is None:
         return None
-    curvature, gain = found
-    other = "scaled_orthographic" if view.bends else "perspective"
-    required = "hardly more than" if gain > MIN_PERSPECTIVE_GAIN else "less than"
+    if view.bends:
+        return (
+            "Perspective explains the tracks hardly better than orthography, so the focal length is uncertain. Give the focal length, or "
+            "compare with camera=scaled_orthographic."
+        )
     return (
-        f"Whether the tracks show perspective is unclear: a focal length of {unit / abs(curvature):.4g} gains {gain:.3f} in the log "
-        f"likelihood per point and frame, {required} the {MIN_PERSPECTIVE_GAIN} required. Give the focal length, or compare with "
-        f"camera={other}."
+        "Whether the tracks show perspective is unclear: it explains them slightly better than orthography, most of all with a focal "
+        f"length of about {unit / abs(found):.4g}. Give the focal length, or compare with camera=perspective."
     )
 
 
