@@ -52,7 +52,7 @@ def plan_of(run: Run, found: Survey, mask: Bools | None, *, region_frame: int, t
 
     By default, the template is the region's frame if that lies in the middle third of the shot or the region is mostly lost there,
     otherwise the sharpest frame of that third: the farther a frame is from the template, the less its picture resembles it. With the region
-    drawn on the first frame, an opening hand was tracked with a median error of .53 px from that frame and .33 px from the middle, and its
+    drawn on the first frame, an opening hand was tracked with a median error of .53 px from that frame and .35 px from the middle, and its
     shapes had errors of .51 and .08.
 
     Raises
