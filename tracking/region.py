@@ -17,7 +17,6 @@ from pliant.tracking.errors import FilmError, TrackingStopped
 from pliant.tracking.flow import Bools, Floats, Grey, dense_flow, match
 from pliant.tracking.records import OnStep, TrackingStep
 from pliant.tracking.seeding import Seeds, default_step, neighbours
-from scipy.spatial import cKDTree
 
 Region = NDArray[np.bool_] | NDArray[np.uint8] | Sequence[Sequence[float]] | Path | str
 
@@ -128,11 +127,15 @@ def _cover(region: Bools, before: Floats, after: Floats, step: float, shape: tup
     mask = np.zeros(shape, dtype=np.uint8)
     if len(before) == 0:
         return mask > 0
-    pixels = np.argwhere(region)[:, ::-1]
-    distance, nearest = cKDTree(before).query(pixels)
-    near = distance <= REACH * step
-    moved = (after - before)[np.asarray(nearest)[near]]
-    x, y = np.round(pixels[near] + moved).astype(np.int64).T
+    x, y = np.round(before).astype(np.int64).T
+    others = np.ones(shape, dtype=np.uint8)
+    others[y, x] = 0
+    distance, label = cv2.distanceTransformWithLabels(others, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    number = np.zeros(label.max() + 1, dtype=np.int64)  # of the point, by label
+    number[label[y, x]] = np.arange(len(before))
+    pixels = np.argwhere(region & (distance <= REACH * step))
+    moved = (after - before)[number[label[tuple(pixels.T)]]]
+    x, y = np.round(pixels[:, ::-1] + moved).astype(np.int64).T
     inside = (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
     mask[y[inside], x[inside]] = 1
     side = 2 * int(np.ceil(step)) + 1

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pliant.tracking import FilmError, FilmLimits, TrackedFilm, open_film, track_film
 from pliant.tracking.estimate import estimate
+from pliant.tracking.region import REACH, _cover
 from pliant.tracking.survey import middle_of
 
 LEFT, RIGHT = 20, 50
@@ -51,6 +52,22 @@ def test_a_region_drawn_after_the_selected_frames_is_carried_back_to_them(film: 
     assert extent(tracked) == pytest.approx(
         (LEFT + 2 * (tracked.template - 9), RIGHT + 2 * (tracked.template - 9)), abs=4
     )
+
+
+def test_a_region_moves_as_a_whole_with_its_visible_points() -> None:
+    region = np.zeros((60, 80), bool)
+    region[10:41, 12:53] = True
+    rows, columns = np.mgrid[12:40:4, 14:52:4]
+    before = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float32)
+    moved = _cover(region, before, before + np.float32([7, 5]), 4.0, region.shape)
+    np.testing.assert_array_equal(moved, np.roll(region, (5, 7), axis=(0, 1)))
+    seen = before[:, 0] < 30
+    part = _cover(region, before[seen], before[seen], 4.0, region.shape)
+    across = np.flatnonzero(part.any(axis=0))
+    assert (across[0], across[-1]) == (12, 26 + int(REACH * 4)), "up to the reach beyond the last visible point"
+    assert not _cover(region, before[:0], before[:0], 4.0, region.shape).any()
+    outside = _cover(region, before, before + np.float32([60, 0]), 4.0, region.shape)
+    assert outside[:, :72].sum() == 0, "what leaves the picture is lost"
 
 
 def test_without_a_region_only_selected_frames_are_read(film: Path) -> None:
