@@ -34,6 +34,8 @@ IMAGE = Path(__file__).parents[2] / "docs" / "images" / "trace.svg"
 WIDTH, LEFT, ROW = 860, 190, 26
 """Layout of the picture, in pixels."""
 
+INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM)
+
 COLOURS = {"API": "#3b6fb6", "queue": "#b0b7c3", "worker": "#2f8f6b", "solver": "#d08a2e"}
 
 
@@ -69,11 +71,11 @@ def installation(folder: Path) -> Iterator[str]:
     url = f"http://127.0.0.1:{port}"
     with attended(settings), ExitStack() as started:
         for name, module in (("api", ["pliant.service"]), ("worker", ["pliant.worker", "work"])):
-            with (folder / f"{name}.spans").open("wb") as out, (folder / f"{name}.log").open("wb") as log:
+            with (folder / f"{name}.spans").open("wb") as out, (folder / f"{name}.log").open("wb") as log, _held():
                 process = subprocess.Popen(
                     [sys.executable, "-m", *module], env=env, stdout=out, stderr=log,
                     # An interruption may come before the next line.
-                    preexec_fn=partial(die_with_parent, os.getpid(), how=signal.SIGTERM),
+                    preexec_fn=partial(_begin, os.getpid()),
                 )  # fmt: skip
             started.enter_context(process)  # waits for its end
             started.callback(process.terminate)
@@ -86,6 +88,22 @@ def installation(folder: Path) -> Iterator[str]:
                 pass
             time.sleep(0.2)
         yield url
+
+
+@contextmanager
+def _held() -> Iterator[None]:
+    """Hold interruptions back: Python ignores exceptions that are raised in what the logging module does after a fork."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPTIONS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _begin(parent: int) -> None:
+    """End with the parent, and receive interruptions again."""
+    die_with_parent(parent, how=signal.SIGTERM)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPTIONS)
 
 
 def read_spans(text: str) -> list[tuple[str, Span]]:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -65,8 +66,10 @@ def test_help_starts_nothing(module: str, tmp_path: Path) -> None:
 def test_an_interrupted_benchmark_ends_what_it_started(module: str, number: int, short_path: Path) -> None:
     environment = {**os.environ, "TMPDIR": str(short_path)}
     with subprocess.Popen(
-        command(module), cwd=ROOT, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    ) as process:
+        command(module), cwd=ROOT, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        # Programs that a shell runs in the background, such as this test, ignore SIGINT, and so do those that they start.
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
+    ) as process:  # fmt: skip
         try:
             while not naming(short_path) and process.poll() is None:
                 time.sleep(0.05)
