@@ -78,7 +78,8 @@ def track_film(
         as well, to follow the region to them.
     template_frame
         Frame whose points are followed to both ends, counted likewise: the selected frame nearest to this number; by default the
-        region's frame if it lies in the middle third of the shot, otherwise the sharpest frame there. The region is followed to it.
+        region's frame if it lies in the middle third of the shot or the region is mostly lost there, otherwise the sharpest frame
+        of that third, to which the region is followed.
     grid_step
         Distance of neighbouring points in the film's pixels, at least one pixel of the tracker's frames; by default 4 to 8 of these,
         chosen for about 4,000 points in the region.

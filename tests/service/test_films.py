@@ -242,12 +242,14 @@ def test_cancelling_stops_the_tracking(running: Running, http: httpx.Client, tmp
 
 
 def test_a_rerun_of_a_film_keeps_its_tracking_options(running: Running, http: httpx.Client, film: bytes) -> None:
-    corners = [[10, 15], [75, 15], [75, 60]]
-    first = send(http, film, options={**QUICK, "region_polygon": corners, "frames": "0:8", "max_points": 30})
+    corners = [[20, 20], [70, 20], [70, 55]]
+    given = {"region_polygon": corners, "frames": "0:8", "template_frame": 0, "max_points": 30}
+    first = send(http, film, options={**QUICK, **given})
     assert work(running, first.id).status is Status.SUCCEEDED
     parts = {"inputs_of": (None, first.id), "options": (None, json.dumps({"loss": "l2", "frames": "0:6"}))}
     again = Job.model_validate_json(http.post("/v1/jobs", files=parts).content)
     assert again.options.region_polygon == first.options.region_polygon
+    assert again.options.template_frame == 0
     assert (again.options.frames, again.options.max_points, again.options.grid_step) == ("0:6", 30, QUICK["grid_step"])
     assert (again.options.loss, again.options.prior) == ("l2", "gaussian")
     parts["options"] = (None, '{"region_polygon": null}')

@@ -820,7 +820,7 @@ export interface components {
             min_seen: number;
             /**
              * Template Frame
-             * @description For a film: the frame whose points are tracked in both directions, counted in the complete film from 0; null: the region's frame if it lies in the middle third of the film, otherwise the sharpest frame there.
+             * @description For a film: the frame whose points are tracked in both directions, counted in the complete film from 0; null: the region's frame if it lies in the middle third of the film or the region is mostly lost there, otherwise the sharpest frame of that third.
              * @default null
              */
             template_frame: number | null;

@@ -40,6 +40,7 @@ from pliant.solver.reconstruction.camera_report import described, improbable, wi
 from pliant.solver.refinement.focal_length import CorrectedEnergy, unclear_perspective
 from pliant.solver.refinement.learned import Learned, motion_of
 from pliant.solver.shapes import perspective_shapes
+from pliant.solver.shapes.assessment import _unclear_camera
 from pliant.solver.tracks import completion
 from pliant.solver.tracks.normalization import normalize
 
@@ -420,6 +421,12 @@ def test_gains_near_the_limit_leave_the_camera_model_unclear(nll: dict[float, fl
     candidates = tuple(Candidate(each, nll[each]) for each in nll)
     view = Perspective(np.zeros((8, 2)), CENTRE, candidates=(Candidate(0.0, 0.0), *candidates))
     assert unclear_perspective(view) == unclear
+    assert (_unclear_camera(view, 100.0) is None) == (unclear is None)
+    if unclear is not None:
+        assert "a focal length of about 1667. " in str(_unclear_camera(view, 100.0))
+        found = str(_unclear_camera(replace(view, curvature=0.03), 100.0))  # after the joint refinement
+        assert "compare with camera=scaled_orthographic" in found
+        assert "1667" not in found, "the focal length reported is another one"
     assert unclear_perspective(replace(view, required=True)) is None
     assert unclear_perspective(replace(view, given=0.1)) is None
     assert unclear_perspective(replace(view, candidates=candidates)) is None  # stopped before orthography was compared
