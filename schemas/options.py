@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from functools import partial
 from numbers import Real
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
     AfterValidator,
@@ -49,10 +49,11 @@ def _in_order(given: tuple[Output, ...]) -> tuple[Output, ...]:
     return tuple(name for name in get_args(Output) if name in given)
 
 
-def _joined(given: object, *, sign: str) -> object:
+def _joined(given: Any, *, sign: str) -> object:
     """Accept a pair of numbers, as Python programs have it, for a text such as `"320x240"`. JSON has no pairs, only lists."""
-    if isinstance(given, tuple) and len(given) == 2 and all(isinstance(number, Real) for number in given):
-        return f"{given[0]}{sign}{given[1]}"
+    pair = tuple(given) if getattr(given, "shape", None) == (2,) else given  # an array; NumPy is not imported here
+    if isinstance(pair, tuple) and len(pair) == 2 and all(isinstance(number, Real) for number in pair):
+        return sign.join(str(int(number) if number == number // 1 else number) for number in pair)
     return given
 
 

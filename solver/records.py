@@ -220,6 +220,7 @@ class KnownCamera:
                 raise wrong_input(
                     "cameras.principal_point", "not_finite", "two finite numbers", str(principal_point), "Give x and y."
                 )
+            principal_point = (float(point[0]), float(point[1]))
         given = numeric(rotations, "rotations", "Give one rotation a frame.").astype(np.float64)
         if given.ndim != 3 or given.shape[1:] not in ((2, 3), (3, 3)) or len(given) == 0:
             raise wrong_input(

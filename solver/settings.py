@@ -143,6 +143,10 @@ class Settings:
         return self.camera != "orthographic"
 
     def __post_init__(self) -> None:
+        for name in ("image_size", "principal_point"):
+            value = getattr(self, name)
+            plain = value.tolist() if isinstance(value, np.ndarray) else value  # an array has no truth value
+            object.__setattr__(self, name, tuple(plain) if isinstance(plain, list) else plain)
         self._check_types()
         check_pinhole(self)
         _check_choice("method", self.method, Method)

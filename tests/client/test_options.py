@@ -44,6 +44,25 @@ def test_pairs_of_numbers_are_accepted_for_texts_of_two_numbers() -> None:
             Options.model_validate({"image_size": wrong})
 
 
+@pytest.mark.parametrize("kind", [np.int64, np.float64, np.float32])
+def test_arrays_of_two_numbers_are_accepted_like_pairs(kind: type) -> None:
+    given = Options.model_validate(
+        {"image_size": np.array([320, 240], kind), "principal_point": np.array([159, 119], kind)}
+    )
+    assert (given.image_size, given.principal_point) == ("320x240", "159,119")
+    assert Options.model_validate({"principal_point": np.array([159.5, 119])}).principal_point == "159.5,119"
+    assert Options.model_validate({"image_size": (320.0, 240.0)}).image_size == "320x240"
+    for wrong in (
+        np.array([320.5, 240]),
+        np.array([320, np.nan]),
+        np.array([1, 2, 3]),
+        np.zeros((2, 2)),
+        np.array(320),
+    ):
+        with pytest.raises(ValueError, match="width and height in pixels, such as 1920x1080"):
+            Options.model_validate({"image_size": wrong})
+
+
 @pytest.mark.parametrize(
     ("given", "meant"),
     [

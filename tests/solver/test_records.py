@@ -244,5 +244,23 @@ class TestSettings:
         assert caught.value.code == "invalid_option"
 
 
+@pytest.mark.parametrize("kind", [np.array, list])
+def test_pairs_may_be_arrays_and_are_kept_as_tuples(kind: Any) -> None:
+    given = Settings(image_size=kind([640, 480]), principal_point=kind([319.5, 2.0]))
+    assert given == Settings(image_size=(640, 480), principal_point=(319.5, 2.0))
+    assert given != Settings(image_size=kind([641, 480]), principal_point=kind([319.5, 2.0]))
+    cameras = KnownCamera.from_arrays(np.tile(np.eye(3), (4, 1, 1)), principal_point=kind([319.5, 2.0]))
+    assert cameras.principal_point == (319.5, 2.0)
+
+
+@pytest.mark.parametrize(
+    "wrong", [np.array(640), np.zeros((2, 2)), np.array([640]), np.array([640, np.nan]), np.array(["a", "b"])]
+)
+def test_an_array_that_is_no_pair_is_refused_in_words(wrong: Any) -> None:
+    for name in ("image_size", "principal_point"):
+        with pytest.raises(InvalidSettings, match=f"options.{name}: expected two .*numbers"):
+            Settings(**{name: wrong})
+
+
 def test_every_outcome_has_a_sentence() -> None:
     assert all(outcome.sentence.endswith(".") for outcome in Outcome)
