@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 import shutil
@@ -10,7 +11,7 @@ import weakref
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,30 @@ class Reconstruction:
             self.folder = self._kept.path
         else:
             self.folder = expanded(folder, "folder")
+
+    def __getstate__(self) -> dict[str, Any]:
+        files = {"arrays": ARRAYS, "report": REPORT}
+        held = {
+            name: getattr(self, name)
+            for name, file in files.items()
+            if name in vars(self) or (self.folder / file).is_file()
+        }
+        return {"job": self.job, "folder": None if "_kept" in vars(self) else self.folder, **held}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        Reconstruction.__init__(self, state["job"], state["folder"])
+        vars(self).update({name: state[name] for name in ("arrays", "report") if name in state})
+
+    def __copy__(self) -> Self:
+        twin = type(self).__new__(type(self))
+        vars(twin).update(vars(self))
+        return twin
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        twin = copy.copy(self)
+        own = {name: value for name, value in vars(self).items() if name in ("job", "arrays", "report")}
+        vars(twin).update(copy.deepcopy(own, memo))
+        return twin
 
     def __repr__(self) -> str:
         size = f"{self.job.interpretation.num_frames} frames × {self.job.interpretation.num_points} points"
@@ -155,6 +180,13 @@ class Reconstruction:
         if not path.is_file():
             raise NotLoaded(f"{name} has not been downloaded yet: call load() on this result first.")
         return path
+
+
+def without_client(job: Job) -> BadArgument:
+    """Return the error for a download through a result that was pickled."""
+    return BadArgument(
+        f"This result was pickled and has no client. Download with `client.download({job.id!r}, folder)` of a new client."
+    )
 
 
 def copied(source: Path, path: Path | str) -> Path:

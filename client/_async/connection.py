@@ -49,6 +49,17 @@ class AsyncConnection:
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.url}>"
 
+    def __copy__(self) -> Self:
+        return self
+
+    def __deepcopy__(self, _: object) -> Self:
+        return self
+
+    def __getstate__(self) -> object:
+        raise TypeError(
+            f"A {type(self).__name__} has connections and a token and cannot be pickled. Create one in each process, and pass ids of jobs."
+        )
+
     async def __aenter__(self) -> Self:
         return self
 

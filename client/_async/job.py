@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 from pliant.client._async.operations import OnJob
 from pliant.client.errors import JobEnded
 from pliant.client.multipart import OnBytes
-from pliant.client.result import ANIMATION, Reconstruction, copied, loaded
+from pliant.client.result import ANIMATION, Reconstruction, copied, loaded, without_client
 from pliant.schemas.job import Job, Status
 from pliant.schemas.options import Options, Output
 from pliant.schemas.shares import Share
@@ -136,11 +136,24 @@ class AsyncRemoteJob:
 
 
 class AsyncResult(Reconstruction):
-    """The result of a job; its methods download the files that are not local yet."""
+    """The result of a job; its methods download the files that are not local yet.
+
+    It can be pickled: the pickle contains the record and, if they have been downloaded, the arrays and the report, but no client, so
+    that what is unpickled downloads nothing and raises `BadArgument` instead. Copies share the client and the folder.
+    """
+
+    _linked: AsyncClient | None = None
+    """None in a result that was unpickled."""
 
     def __init__(self, client: AsyncClient, job: Job, folder: Path | str | None) -> None:
         super().__init__(job, folder)
-        self._client = client
+        self._linked = client
+
+    @property
+    def _client(self) -> AsyncClient:
+        if self._linked is None:
+            raise without_client(self.job)
+        return self._linked
 
     async def load(self, *, timeout: float | None = None) -> Self:
         """Download the arrays and the report."""

@@ -50,6 +50,17 @@ class Connection:
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.url}>"
 
+    def __copy__(self) -> Self:
+        return self
+
+    def __deepcopy__(self, _: object) -> Self:
+        return self
+
+    def __getstate__(self) -> object:
+        raise TypeError(
+            f"A {type(self).__name__} has connections and a token and cannot be pickled. Create one in each process, and pass ids of jobs."
+        )
+
     def __enter__(self) -> Self:
         return self
 

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import copy
+import pickle
 import ssl
+from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
-from pliant.client import AsyncClient, BadArgument, Client
+from pliant.client import AsyncClient, BadArgument, Client, NotLoaded, Result
+from pliant.service.testing import InMemoryService
 
 
 def sent(client: Client) -> httpx.Request:
@@ -87,3 +92,54 @@ def test_verify_reaches_httpx(monkeypatch: pytest.MonkeyPatch) -> None:
     for verify in (True, False, context):
         Client(verify=verify)
     assert given == [True, False, context]
+
+
+POINTS = np.random.default_rng(0).normal(size=(6, 16, 2)) * 100
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["a folder of its own", "a temporary folder"])
+def test_a_pickled_result_has_arrays_and_report_but_neither_client_nor_token(given: bool, tmp_path: Path) -> None:
+    service = InMemoryService(auth="required")
+    token = service.create_token()
+    client = Client("http://pliant.test", token=token, transport=service)
+    result = client.submit(POINTS).wait(folder=tmp_path / "own" if given else None, timeout=60)
+    shapes, report = result.shapes.copy(), dict(result.report)
+    sent = pickle.dumps(result)
+    assert token.encode() not in sent
+    del result
+    again = pickle.loads(sent)
+    assert isinstance(again, Result)
+    np.testing.assert_array_equal(again.shapes, shapes)
+    assert again.report == report
+    assert (again.folder == tmp_path / "own") is given
+    with pytest.raises(BadArgument, match=f"has no client. Download with `client.download\\('{again.job.id}'"):
+        again.save_glb(tmp_path / "moving.glb")
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(again)).shapes, shapes)
+
+
+def test_a_result_without_files_is_pickled_without_arrays() -> None:
+    client = Client("http://pliant.test", transport=InMemoryService())
+    again = pickle.loads(pickle.dumps(client.submit(POINTS).wait(load=False, timeout=60)))
+    with pytest.raises(NotLoaded):
+        _ = again.shapes
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy])
+def test_copies_of_a_result_share_its_client_and_folder(duplicate: object, tmp_path: Path) -> None:
+    assert callable(duplicate)
+    job = Client("http://pliant.test", transport=InMemoryService()).submit(POINTS)
+    result = job.wait(timeout=60)
+    shapes = result.shapes.copy()
+    twin = duplicate(result)
+    assert (twin.shapes is result.shapes) is (duplicate is copy.copy)
+    del result
+    assert twin.save_glb(tmp_path / "moving.glb").stat().st_size > 0
+    np.testing.assert_array_equal(twin.shapes, shapes)
+    assert duplicate(job).wait(timeout=60).job == twin.job
+
+
+def test_a_client_cannot_be_pickled_and_says_what_to_do() -> None:
+    with pytest.raises(
+        TypeError, match=r"A Client has connections and a token and cannot be pickled. Create one in each"
+    ):
+        pickle.dumps(Client(transport=ECHO))
