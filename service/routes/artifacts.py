@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from itertools import chain
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query, Request
+from fastapi import Path, Query, Request
 from fastapi.responses import RedirectResponse, Response, StreamingResponse
 from pliant.schemas.job import Artifact
 from pliant.schemas.problems import ProblemCode
@@ -16,10 +16,11 @@ from pliant.service.openapi import problems
 from pliant.service.problems import Refusal
 from pliant.service.ranges import Slice, decide
 from pliant.service.routes.jobs import Id
+from pliant.service.routes.router import Router
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.store.blobs import Blob
 
-router = APIRouter(prefix="/v1/jobs/{id}/artifacts", tags=["artifacts"])
+router = Router(prefix="/v1/jobs/{id}/artifacts", tags=["artifacts"])
 
 Name = Annotated[str, Path(description="A file of the job.", examples=["shapes.npz"])]
 Redirect = Annotated[
@@ -39,7 +40,6 @@ def artifacts(id: Id, jobs: Mine) -> list[Artifact]:
     return jobs.get(id).artifacts
 
 
-@router.head("/{name}", include_in_schema=False)
 @router.get(
     "/{name}",
     operation_id="get_artifact",

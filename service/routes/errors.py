@@ -5,15 +5,16 @@ from __future__ import annotations
 from html import escape
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Path
+from fastapi import Header, Path
 from fastapi.responses import HTMLResponse, Response
 from pliant.schemas.job import Record
 from pliant.schemas.problems import ProblemCode
 from pliant.service.openapi import problems
 from pliant.service.problems import Refusal
+from pliant.service.routes.router import Router
 from pydantic import Field
 
-router = APIRouter(prefix="/errors", tags=["about"])
+router = Router(prefix="/errors", tags=["about"])
 
 
 class ErrorCode(Record):

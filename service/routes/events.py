@@ -9,17 +9,18 @@ from functools import lru_cache, partial
 from typing import Annotated
 
 from anyio import to_thread
-from fastapi import APIRouter, Header, Request
+from fastapi import Header, Request
 from fastapi.responses import PlainTextResponse, Response, StreamingResponse
 from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 from pliant.service.dependencies import Core, Mine
 from pliant.service.event_stream import KEPT
 from pliant.service.openapi import problems
 from pliant.service.routes.jobs import Id
+from pliant.service.routes.router import Router
 from pliant.worker.errors import WorkerError
 from pliant.worker.records import Event
 
-router = APIRouter(prefix="/v1/jobs/{id}", tags=["jobs"])
+router = Router(prefix="/v1/jobs/{id}", tags=["jobs"])
 
 RECONNECT_MS = 2000
 """Pause before a client reconnects, in milliseconds."""
@@ -69,8 +70,9 @@ async def events(
     stream = core.followers.follow(jobs, id, after=last or None, heartbeat=core.settings.heartbeat_seconds)
     # Refuse before the stream begins, while a status code can still report an error.
     await to_thread.run_sync(partial(jobs.events, id, after=last or None))
+    encoded = _encode(stream, still_valid=request.scope.get("pliant.still_valid"))
     return EventSourceResponse(
-        _encode(stream, still_valid=request.scope.get("pliant.still_valid")),
+        iter(()) if request.method == "HEAD" else encoded,  # an answer without body need not last until the job ends
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
 

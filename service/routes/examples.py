@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Request
+from fastapi import Path, Request
 from fastapi.responses import Response
 from pliant.schemas.job import Record
 from pliant.service.openapi import problems
+from pliant.service.routes.router import Router
 from pliant.worker.examples import EXAMPLES, example_file
 from pliant.worker.films import example as example_film
 from pydantic import Field
 
-router = APIRouter(prefix="/v1/examples", tags=["about"])
+router = Router(prefix="/v1/examples", tags=["about"])
 
 Name = Annotated[str, Path(description="An example's name.", examples=["face"])]
 File = Annotated[str, Path(description="One of its files.", examples=["tracks.npz"])]

@@ -7,13 +7,14 @@ from contextlib import suppress
 from typing import Annotated
 
 from anyio import to_thread
-from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+from fastapi import Depends, Header, Path, Query, Request, Response
 from pliant.schemas.job import LONGEST_KEY, Job, JobPage, Status
 from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Bound, Bounds, Core, Mine, Service, my_uploads
 from pliant.service.multipart import receive_form
 from pliant.service.openapi import JOB_EXAMPLE, SUBMIT_BODY, problems
 from pliant.service.problems import Refusal
+from pliant.service.routes.router import Router
 from pliant.service.submission import accept, form_rules
 from pliant.worker.errors import StoreUnavailable, UnknownJob
 from pliant.worker.jobs.retry import retry as run_again
@@ -21,7 +22,7 @@ from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.validation import LARGEST_PAGE, check_key
 from pydantic import WithJsonSchema
 
-router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+router = Router(prefix="/v1/jobs", tags=["jobs"])
 
 Id = Annotated[str, Path(description="The job's id.", examples=["4f0c6b1d2a9e8c7b5d3f"])]
 _KeyHeader = Annotated[

@@ -74,11 +74,11 @@ def create_viewer(folder: Path, token: str) -> FastAPI:
     names = {artifact.name for artifact in job.artifacts}
     page = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
-    @page.get("/v1/jobs/{id}")
+    @page.api_route("/v1/jobs/{id}", methods=["GET", "HEAD"])
     def record(id: str) -> Response:
         return JSONResponse(job.model_dump(mode="json")) if id == ID else _unknown(id)
 
-    @page.get("/v1/jobs/{id}/artifacts/{name}")
+    @page.api_route("/v1/jobs/{id}/artifacts/{name}", methods=["GET", "HEAD"])
     def artifact(id: str, name: str) -> Response:
         if id != ID or name not in names:
             return _unknown(name)

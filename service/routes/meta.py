@@ -6,16 +6,17 @@ import dataclasses
 import logging
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Query
+from fastapi import Query
 from pliant.schemas.job import ServiceLimits
 from pliant.schemas.options import Options
 from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Bound, Core
 from pliant.service.openapi import problems
 from pliant.service.problems import Refusal
+from pliant.service.routes.router import Router
 from pliant.worker.jobs.validation import LARGEST_PAGE
 
-router = APIRouter(tags=["about"])
+router = Router(tags=["about"])
 
 Part = Literal["redis", "blobs", "workers"]
 
@@ -41,14 +42,12 @@ def limits(core: Core, bounds: Bound) -> ServiceLimits:
     )
 
 
-@router.head("/healthz", include_in_schema=False)
 @router.get("/healthz", operation_id="get_health", summary="Liveness: the process answers")
 async def healthz() -> dict[str, str]:
     """Return 200 while the process responds. It checks nothing else and does not wait for a thread."""
     return {"status": "ok"}
 
 
-@router.head("/readyz", include_in_schema=False)
 @router.get(
     "/readyz", operation_id="get_readiness", summary="Readiness: all parts answer", responses=problems(422, 503)
 )

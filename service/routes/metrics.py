@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
 from fastapi.responses import PlainTextResponse, Response
 from pliant.service.dependencies import Core
 from pliant.service.metrics import MEDIA_TYPE
 from pliant.service.openapi import problems
+from pliant.service.routes.router import Router
 
-router = APIRouter(tags=["about"])
+router = Router(tags=["about"])
 
 _TEXT = {
     "text/plain": {

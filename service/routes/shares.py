@@ -5,15 +5,16 @@ from __future__ import annotations
 from typing import Annotated
 
 from anyio import to_thread
-from fastapi import APIRouter, Path, Request
+from fastapi import Path, Request
 from pliant.schemas.shares import Share, ShareRequest
 from pliant.service.dependencies import Mine
 from pliant.service.openapi import problems
 from pliant.service.routes.jobs import Id
 from pliant.service.routes.json_body import body_of, read_json
+from pliant.service.routes.router import Router
 from pliant.worker.jobs.sharing import create_share, list_shares, revoke_share
 
-router = APIRouter(prefix="/v1/jobs/{id}/shares", tags=["artifacts"])
+router = Router(prefix="/v1/jobs/{id}/shares", tags=["artifacts"])
 
 
 @router.post(

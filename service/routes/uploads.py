@@ -29,7 +29,7 @@ from pliant.worker.errors import OffsetMismatch
 from pliant.worker.uploads.service import Uploads
 from pliant.worker.uploads.writer import Capacity, Writer
 
-router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
+router = APIRouter(prefix="/v1/uploads", tags=["uploads"])  # not `Router`: HEAD has an answer of its own
 
 ANY = 2**62
 MISMATCH = "https://iana.org/assignments/http-problem-types#mismatching-upload-offset"

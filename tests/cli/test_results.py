@@ -136,6 +136,8 @@ def test_the_viewer_serves_only_its_result_and_only_under_its_token(folder: Path
     assert (record["status"], record["name"], record["metrics"]) == ("succeeded", folder.name, {"e3d_frame": 0.5})
     assert {each["name"] for each in record["artifacts"]} == {"shapes.npz", "shapes.glb", "preview.bin", "report.json"}
     part = client.get("/secret/v1/jobs/local/artifacts/preview.bin", headers={"Range": "bytes=0-7"})
+    head = client.head("/secret/v1/jobs/local/artifacts/preview.bin")
+    assert (head.status_code, head.headers["content-length"]) == (200, str((folder / "preview.bin").stat().st_size))
     assert (part.status_code, part.content) == (206, b"PLIANTPV")
     missing = (
         "/v1/jobs/local", "/guess/v1/jobs/local", "/secret/v1/jobs/other", "/secret/v1/jobs/local/artifacts/private.txt",

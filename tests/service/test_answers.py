@@ -162,8 +162,8 @@ def test_allow_names_every_method_of_an_address(http: httpx.Client) -> None:
         assert answer.status_code == 405
         return answer.headers["allow"]
 
-    assert allowed("PATCH", "/v1/jobs/abc") == "DELETE, GET, PUT"
-    assert allowed("OPTIONS", "/v1/jobs") == "GET, POST"
+    assert allowed("PATCH", "/v1/jobs/abc") == "DELETE, GET, HEAD, PUT"
+    assert allowed("OPTIONS", "/v1/jobs") == "GET, HEAD, POST"
     assert allowed("POST", "/v1/jobs/abc/artifacts/shapes.npz") == "GET, HEAD"
 
 
@@ -219,10 +219,44 @@ def test_parsing_one_file_gets_no_more_memory_than_reading(running: Running, gib
     assert (found.read_memory, found.parse_memory) == (gibibytes << 30, parse << 30)
 
 
-@pytest.mark.parametrize("path", ["/healthz", "/readyz?exclude=workers"])
-def test_health_checks_answer_head(http: httpx.Client, path: str) -> None:
-    answer = http.head(path)
-    assert (answer.status_code, answer.content) == (200, b"")
+VARYING = {"date", "x-request-id", "transfer-encoding"}
+"""Headers that differ between two equal requests, or describe how a body is sent."""
+
+
+def test_head_answers_every_get_route_with_its_status_and_headers_and_no_body(
+    running: Running, http: httpx.Client
+) -> None:
+    job = submit(http)
+    finish(running, job.id, b"result")
+    values = {"id": job.id, "name": "shapes.npz", "code": "unknown_job"}
+    document = running.app.openapi()["paths"]
+    paths = [path for path, operations in document.items() if "get" in operations and "uploads" not in path]
+    assert not any("head" in operations for path, operations in document.items() if "uploads" not in path)
+    assert len(paths) >= 14
+    for path in paths:
+        address = "/v1/examples/face/tracks.npz" if "{file}" in path else path.format(**values)
+        address += "?exclude=workers" if path == "/readyz" else ""
+        got, head = http.get(address), http.head(address)
+        assert (head.status_code, head.content) == (200, b""), path
+        assert {name: text for name, text in head.headers.items() if name not in VARYING | {"content-length"}} == {
+            name: text for name, text in got.headers.items() if name not in VARYING | {"content-length"}
+        }, path
+        if path != "/metrics":  # it counts the requests
+            assert head.headers.get("content-length") == got.headers.get("content-length"), path
+    for address in (
+        "/v1/jobs/nobody",
+        "/v1/jobs/nobody/events",
+        f"/v1/jobs/{job.id}/artifacts/none.txt",
+        "/errors/none",
+    ):
+        assert http.head(address).status_code == http.get(address).status_code == 404
+    file = http.head(f"/v1/jobs/{job.id}/artifacts/shapes.npz").headers
+    assert (file["content-length"], file["etag"]) == ("6", f'"{hashlib.sha256(b"result").hexdigest()}"')
+
+
+def test_head_of_the_events_of_a_running_job_does_not_wait_for_its_end(http: httpx.Client) -> None:
+    answer = http.head(f"/v1/jobs/{submit(http).id}/events", timeout=10)
+    assert (answer.status_code, answer.headers["content-type"]) == (200, "text/event-stream; charset=utf-8")
 
 
 @pytest.mark.parametrize(
