@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated
 
 import typer
-from pliant.cli.exits import Exit, ending_in_order
+from pliant.cli.exits import Exit
 from pliant.cli.extras import require_server
 from pliant.cli.paths import RESULT_FILES, different_files, output_folder
 from pliant.cli.session import LINE_EVERY, Force, Json, Session
@@ -99,7 +99,7 @@ def demo(
         width, height = scene.size
         out().print(f"Rendering a film of a talking face: {scene.frames} frames of {width}×{height} pixels …")
     film = render(scene, output)
-    with ending_in_order(), tempfile.TemporaryDirectory(prefix="pliant-demo-") as folder, running(Path(folder)) as url:
+    with tempfile.TemporaryDirectory(prefix="pliant-demo-") as folder, running(Path(folder)) as url:
         from pliant.client.progress import progress_bar
 
         with session.client(url, as_json=as_json) as client, progress_bar(line_every=LINE_EVERY) as bar:
@@ -254,7 +254,7 @@ def announced(stream: IO[str]) -> str | None:
 
 
 def wait_for_interrupt() -> None:
-    """Sleep until Ctrl-C, SIGTERM or SIGHUP; see `ending_in_order`."""
+    """Sleep until Ctrl-C, SIGTERM or SIGHUP."""
     try:
         signal.pause()
     except KeyboardInterrupt:

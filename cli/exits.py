@@ -6,6 +6,7 @@ import errno
 import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import IntEnum
@@ -39,7 +40,7 @@ class Exit(IntEnum):
     UNHEALTHY = 8
     """`doctor` or `fsck` found a fault, or the command needs an extra that is not installed."""
     INTERRUPTED = 130
-    """Ctrl-C."""
+    """Ctrl-C, SIGTERM or SIGHUP."""
 
 
 _CODES: tuple[tuple[str, str, Exit], ...] = (
@@ -133,7 +134,8 @@ class Guarded(TyperGroup):
         """Run the command."""
         as_json = "--json" in ctx.args
         try:
-            return super().invoke(ctx)
+            with ending_in_order():
+                return super().invoke(ctx)
         except (Exception, KeyboardInterrupt) as caught:
             fault: BaseException = caught
             if isinstance(fault, ModuleNotFoundError) and (fault.name or "").partition(".")[0] in SERVER_MODULES:
@@ -181,7 +183,8 @@ def _suggest(fault: Any) -> None:
 @contextmanager
 def ending_in_order() -> Iterator[None]:
     """Make SIGTERM and the end of the terminal work like Ctrl-C, so that processes end and temporary files are removed."""
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    main = threading.current_thread() is threading.main_thread()  # only there can handlers be set
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if main and hasattr(signal, name)]
     numbers = [each for each in numbers if signal.getsignal(each) != signal.SIG_IGN]  # as with nohup
     handlers = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
     try:

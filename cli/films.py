@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pliant.cli.exits import ending_in_order
 from pliant.cli.session import LINE_EVERY
 from pliant.cli.show import err, needs, out, show_warnings
 
@@ -161,7 +160,6 @@ def solve_film(
             out().print(note)
     on_warnings(warnings_of_check(read.facts, region, read.options))
     with (
-        ending_in_order(),
         tempfile.TemporaryDirectory(prefix="pliant-film-") as scratch,
         progress_bar(screen, line_every=LINE_EVERY) as bar,
         threads_limited(threads),

@@ -463,6 +463,41 @@ def test_ctrl_c_while_solving_leaves_no_output(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+STOPPED = """
+import os, signal, sys
+name, number = sys.argv[1], int(sys.argv[2])
+class Watch:
+    def find_spec(self, found, path=None, target=None):
+        if found == name:
+            print("stopping at", found)
+            os.kill(os.getpid(), number)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.meta_path.insert(0, Watch())
+sys.argv = ["pliant", *sys.argv[3:]]
+from pliant.cli import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("imported", "number"),
+    [
+        ("typer", signal.SIGINT),
+        ("pliant.worker.execution.pipeline", signal.SIGTERM),
+        ("pliant.worker.execution.pipeline", signal.SIGHUP),
+    ],
+    ids=["Ctrl-C at the start", "SIGTERM while solving", "SIGHUP while solving"],
+)
+def test_solve_ends_in_order_at_any_time(tmp_path: Path, tracks: Path, imported: str, number: int) -> None:
+    if signal.getsignal(number) == signal.SIG_IGN and number != signal.SIGINT:
+        pytest.skip("these tests run under nohup")
+    command = [sys.executable, "-c", STOPPED, imported, str(int(number)), "solve", str(tracks), "-o", "out"]
+    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert (ran.returncode, ran.stderr.rpartition("\n")[0]) == (Exit.INTERRUPTED, "error Interrupted.")
+    assert f"stopping at {imported}" in ran.stdout
+    assert not (tmp_path / "out").exists()
+
+
 def test_ctrl_c_while_waiting_prints_how_to_resume(
     run: Run, tracks: Path, service: InMemoryService, monkeypatch: pytest.MonkeyPatch
 ) -> None:

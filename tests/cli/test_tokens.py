@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 from io import StringIO
 
 import pytest
-from pliant.cli.tokens import table_of
+from pliant.cli.commands.tokens import table_of
 from pliant.worker.tokens import Scope, Token
 from rich.console import Console
 
