@@ -230,7 +230,7 @@ def seconds_of(retry_after: str | None) -> float | None:
     """Read a Retry-After header, seconds or an HTTP date; an invalid one counts as absent."""
     if retry_after is None:
         return None
-    if retry_after.strip().isdigit():
+    if retry_after.strip().isdecimal():
         return float(retry_after)
     try:
         moment = parsedate_to_datetime(retry_after)

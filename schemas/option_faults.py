@@ -31,6 +31,6 @@ def option_fault(error: Mapping[str, Any]) -> Invalid:
 
 
 def shown(value: object) -> str:
-    """Return a value's text, cut to `LONGEST` characters."""
-    text = repr(value)
+    """Return a value's text, cut to `LONGEST` characters; bytes are shown as text."""
+    text = repr(value.decode("utf-8", "backslashreplace") if isinstance(value, bytes) else value)
     return text if len(text) <= LONGEST else text[: LONGEST - 3] + "…"

@@ -125,7 +125,7 @@ async def batches(request: Request, *, max_bytes: int, stall_seconds: float) -> 
         The body is incomplete. Then, and before a 408, the bytes that have arrived are yielded first.
     """
     declared = request.headers.get("content-length", "")
-    if declared.isdigit() and int(declared) > max_bytes:
+    if declared.isdecimal() and int(declared) > max_bytes:
         raise _too_large(max_bytes, f"{declared} bytes declared")
     stream = request.stream()
     gathered: list[bytes] = []

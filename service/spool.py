@@ -12,8 +12,9 @@ import secrets
 import shutil
 import tempfile
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -62,12 +63,18 @@ class Incoming:
         os.close(self._lock)
         self._own, self._lock = None, -1
 
-    @contextmanager
-    def scratch(self) -> Iterator[Path]:
-        """Create an empty scratch directory, and remove it with its contents when the block ends."""
+    @asynccontextmanager
+    async def scratch(self) -> AsyncIterator[Path]:
+        """Create an empty scratch directory, and remove it with its contents when the block ends, both on a thread."""
         assert self._own is not None, "open() comes first"
-        with tempfile.TemporaryDirectory(dir=self._own, prefix="", ignore_cleanup_errors=True) as path:
+        path = await to_thread.run_sync(partial(tempfile.mkdtemp, dir=self._own, prefix=""))
+        try:
             yield Path(path)
+        finally:
+            with anyio.CancelScope(
+                shield=True
+            ):  # removal of gigabytes takes a while, in which the client may disconnect
+                await to_thread.run_sync(partial(shutil.rmtree, path, ignore_errors=True))
 
     def abandoned(self) -> list[str]:
         """Return the sub-folders of ended processes, which the next process that starts will remove."""

@@ -5,11 +5,14 @@ from __future__ import annotations
 import ipaddress
 import math
 import os
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import quote
 
+from pliant.worker.control_group import group_files
 from pliant.worker.environment import read, variable_of
 from pliant.worker.paths import socket_path
 from pydantic import AfterValidator, Field
@@ -20,18 +23,17 @@ NUMERICAL_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 threads busy-wait, which slows down all processes on a loaded machine (`benchmarks/README.md`)."""
 
 
-CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
-"""File with a container's processor quota: `quota period` in microseconds, or `max period` (cgroup v2)."""
+def usable_cores(quotas: Sequence[Path] | None = None) -> int:
+    """Return the number of cores this process may use, by its affinity mask and the quotas of container and systemd unit.
 
-
-def usable_cores(quota: Path = CPU_QUOTA) -> int:
-    """Return the number of cores this process may use, by its affinity mask and its container's quota."""
+    They are in the files `quotas`: `quota period` in microseconds, or `max period`.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    try:
-        share, period = map(float, quota.read_text().split())
-    except (OSError, ValueError):  # no such file, or "max": no limit
-        return cores
-    return max(1, min(cores, math.ceil(share / period)))
+    for file in group_files("cpu.max") if quotas is None else quotas:
+        with suppress(OSError, ValueError):  # no such file, or "max": no limit
+            share, period = map(float, file.read_text().split())
+            cores = min(cores, math.ceil(share / period))
+    return max(1, cores)
 
 
 def _networks(text: str) -> str:

@@ -43,7 +43,7 @@ async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUpload
     refused: the interpretation of an earlier job's inputs is in its record.
     """
     rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
-    with core.incoming.scratch() as folder:
+    async with core.incoming.scratch() as folder:
         form = await receive_form(request, folder, rules=rules)
         return await core.parsing.run(uploads.owner, lambda: interpret(form, folder, uploads, core))
 

@@ -189,7 +189,7 @@ async def _receive(
     """Receive a form into a scratch directory and submit the job; the directory is always removed."""
     rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
     await to_thread.run_sync(lambda: jobs.check_capacity(id=id, idempotency_key=idempotency_key))
-    with core.incoming.scratch() as folder:
+    async with core.incoming.scratch() as folder:
         form = await receive_form(request, folder, rules=rules)
         return await core.parsing.run(
             jobs.owner or "",

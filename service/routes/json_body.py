@@ -27,10 +27,10 @@ async def read_json(request: Request, model: type[Model]) -> Model:
     if kind not in ("", "application/json"):
         detail = "The body must be JSON: send it with `Content-Type: application/json`. An example is at /docs."
         raise Refusal(ProblemCode.UNSUPPORTED_MEDIA_TYPE, detail=detail, expected="application/json", got=kind[:80])
-    limits = {"max_bytes": settings.max_text_bytes, "stall_seconds": settings.stall_seconds}
-    body = b"".join([piece async for piece in batches(request, **limits)])  # type: ignore[arg-type]
+    pieces = batches(request, max_bytes=settings.max_text_bytes, stall_seconds=settings.stall_seconds)
+    body = b"".join([piece async for piece in pieces])
     try:
-        return model.model_validate_json(body.decode("utf-8", "replace") or "{}")
+        return model.model_validate_json(body or b"{}")
     except ValidationError as error:
         raise from_validation(error.errors()) from None
 

@@ -200,7 +200,7 @@ class Sending:
     def of(cls, request: Request, *, offset: int, complete: str, length: int | None, digest: str | None) -> Sending:
         """Read the headers; the length of the last body determines the length of the whole upload."""
         last, body = complete == "?1", request.headers.get("content-length", "")
-        if length is None and last and body.isdigit():
+        if length is None and last and body.isdecimal():
             length = offset + int(body)
         return cls(offset=offset, last=last, length=length, sha256=_sha256(digest))
 

@@ -12,6 +12,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import anyio
 import httpx
 import pytest
 from pliant.schemas.job import Status
@@ -203,6 +204,15 @@ def test_a_body_that_is_not_json_is_described(http: httpx.Client) -> None:
     assert answer.json()["got"] == """'{"days":'"""
 
 
+def test_a_body_that_is_not_utf8_is_refused(http: httpx.Client) -> None:
+    job = submit(http)
+    answer = http.post(
+        f"/v1/jobs/{job.id}/shares", content=b'{"days": "\xff"}', headers={"Content-Type": "application/json"}
+    )
+    assert answer.status_code == 422
+    assert "invalid unicode" in answer.json()["expected"]
+
+
 @pytest.mark.parametrize(("gibibytes", "parse"), [(3, 3), (8, 4)])
 def test_parsing_one_file_gets_no_more_memory_than_reading(running: Running, gibibytes: int, parse: int) -> None:
     settings = replace(running.jobs.settings, read_memory=gibibytes << 30)
@@ -349,14 +359,19 @@ def test_scratch_folders_of_dead_processes_are_removed_live_ones_kept(tmp_path: 
     (tmp_path / "dead").mkdir()
     (tmp_path / "dead" / "part").write_bytes(b"x")
     (tmp_path / "dead.lock").touch()
-    with living.scratch() as room:
-        (room / "part").write_bytes(b"x")
-        assert Incoming(tmp_path).abandoned() == ["dead"]
-        second = Incoming(tmp_path)
-        second.open()
-        assert not (tmp_path / "dead").exists()
-        assert (room / "part").read_bytes() == b"x"
-        second.close()
+
+    async def receive() -> None:
+        async with living.scratch() as room:
+            (room / "part").write_bytes(b"x")
+            assert Incoming(tmp_path).abandoned() == ["dead"]
+            second = Incoming(tmp_path)
+            second.open()
+            assert not (tmp_path / "dead").exists()
+            assert (room / "part").read_bytes() == b"x"
+            second.close()
+        assert not room.exists()
+
+    anyio.run(receive)
     living.close()
     assert list(tmp_path.iterdir()) == []
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from pliant.service.settings import ServiceSettings
+from pliant.worker.control_group import group_files
 from pliant.worker.environment import expected_of, fields_of, variable_of
 from pliant.worker.errors import InvalidSetting
 from pliant.worker.paths import LONGEST_SOCKET_PATH, socket_path
@@ -159,4 +160,20 @@ def test_a_containers_cpu_quota_limits_the_cores(
     file = tmp_path / "cpu.max"
     if text is not None:
         file.write_text(text)
-    assert usable_cores(file) == cores
+    assert usable_cores([file]) == cores
+    (around := tmp_path / "around.max").write_text("100000 100000\n")
+    assert usable_cores([file, around]) == 1
+
+
+def test_limits_are_read_from_the_own_control_group_and_those_around_it(tmp_path: Path) -> None:
+    membership, root = tmp_path / "cgroup", tmp_path / "mounted"
+    membership.write_text("4:memory:/elsewhere\n0::/system.slice/pliant.service\n")
+    found = group_files("memory.max", root=root, membership=membership)
+    assert [str(file.relative_to(root)) for file in found] == [
+        "system.slice/pliant.service/memory.max",
+        "system.slice/memory.max",
+        "memory.max",
+    ]
+    membership.write_text("0::/\n")  # a container sees itself as the root
+    assert group_files("cpu.max", root=root, membership=membership) == [root / "cpu.max"]
+    assert group_files("cpu.max", root=root, membership=tmp_path / "none") == []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -90,8 +89,6 @@ def _written(
     try:
         with aside.open("wb") as file:
             put(file)
-            file.flush()
-            os.fsync(file.fileno())
         aside.replace(directory / name)
     finally:
         aside.unlink(missing_ok=True)

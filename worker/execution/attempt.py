@@ -44,6 +44,9 @@ PROGRESS_INTERVAL = 0.5
 STATUS_INTERVAL = 0.25
 """Minimum seconds between two reads of the job's status."""
 
+PAUSE_AFTER_SILENCE = 4.0
+"""Pause after a call that the store did not answer, in durations of the call: a store that hangs slows a job down by at most a quarter."""
+
 PATIENCE = 60.0
 """Seconds for which calls to an unavailable store are retried when claiming the job, reading its inputs and publishing its result."""
 
@@ -109,6 +112,8 @@ class Attempt:
     stages: tracing.Stages = field(default_factory=tracing.Stages)
     """Trace spans of the stages."""
     _next_look: float = 0.0
+    _silent_until: float = 0.0
+    """Monotonic time before which the store is not asked again, since it did not answer."""
     _lines: list[str] = field(default_factory=list)
     """Log lines that are not written yet."""
     _log_lock: threading.Lock = field(default_factory=threading.Lock)
@@ -118,7 +123,7 @@ class Attempt:
         """Write the progress, at most every `PROGRESS_INTERVAL` seconds within a stage. An unavailable store is ignored."""
         self.stages.enter(progress.stage)
         now = time.monotonic()
-        if now < self._next_report and progress.stage == self._stage:
+        if now < self._silent_until or (now < self._next_report and progress.stage == self._stage):
             return
         self._next_report, self._stage = now + PROGRESS_INTERVAL, progress.stage
         try:
@@ -129,6 +134,7 @@ class Attempt:
         except (StaleAttempt, UnknownJob):
             self.unwanted = True
         except StoreUnavailable as error:
+            self._pause_since(now)
             logger.warning("progress not written: %s", error)
 
     def should_stop(self) -> bool:
@@ -138,7 +144,7 @@ class Attempt:
             self._next_look = now + STATUS_INTERVAL
             if os.getppid() != self._parent:
                 os._exit(1)  # orphaned, where the kernel does not kill orphans; the reconciler requeues the job
-            self.unwanted = now >= self.deadline or self._status() is not Status.RUNNING
+            self.unwanted = now >= self.deadline or self._status(now) is not Status.RUNNING
         return self.unwanted
 
     def log(self, text: str) -> None:
@@ -224,11 +230,18 @@ class Attempt:
         """Blob prefix of this attempt's artifacts, which are published when the job's record names the prefix."""
         return f"jobs/{self.id}/{self.attempt_id}/artifacts/"
 
-    def _status(self) -> Status | None:
+    def _status(self, now: float) -> Status | None:
+        if now < self._silent_until:
+            return Status.RUNNING
         try:
             return self.jobs.records.look(self.id, self.attempt_id)
         except StoreUnavailable:
+            self._pause_since(now)
             return Status.RUNNING
+
+    def _pause_since(self, began: float) -> None:
+        now = time.monotonic()
+        self._silent_until = now + PAUSE_AFTER_SILENCE * (now - began)
 
     def _flush(self) -> None:
         with self._log_lock:
@@ -328,11 +341,15 @@ def limited_memory(limit: int) -> Iterator[None]:
     """Limit the address space, so that too large an array raises MemoryError instead of ending the process."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     allowed = limit or soft
-    resource.setrlimit(resource.RLIMIT_AS, (allowed if hard == resource.RLIM_INFINITY else min(allowed, hard), hard))
+    with contextlib.suppress(ValueError, OSError):  # macOS has no limit on the address space
+        resource.setrlimit(
+            resource.RLIMIT_AS, (allowed if hard == resource.RLIM_INFINITY else min(allowed, hard), hard)
+        )
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+        with contextlib.suppress(ValueError, OSError):
+            resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
 @contextlib.contextmanager

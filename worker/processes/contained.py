@@ -161,10 +161,12 @@ class _Progress:
         if len(self._rest) > MAX_LINE:
             self._rest = b""
         for line in lines:
-            with suppress(ValueError):
+            try:
                 stated = json.loads(line)
-                if isinstance(stated, dict):
-                    self._on_line(stated)
+            except ValueError:  # torn by the end of the process
+                continue
+            if isinstance(stated, dict):
+                self._on_line(stated)
 
 
 def refusal_in(ended: Ended) -> dict[str, Any] | None:

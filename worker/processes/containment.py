@@ -9,6 +9,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from pliant.worker.control_group import group_files
+
 _PR_SET_PDEATHSIG = 1
 _libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
@@ -34,22 +36,12 @@ class OomKills:
     @classmethod
     def now(cls) -> OomKills:
         """Read the kernel's counters; 0 where they do not exist."""
-        return cls(_counter(_group_events(), "oom_kill"), _counter(Path("/proc/vmstat"), "oom_kill"))
+        own = [*group_files("memory.events")[:1], Path("/sys/fs/cgroup/memory/memory.oom_control")]  # cgroup v2 and v1
+        return cls(sum(_counter(file, "oom_kill") for file in own), _counter(Path("/proc/vmstat"), "oom_kill"))
 
     def since(self, before: OomKills) -> bool:
         """Return whether the kernel killed a process since an earlier reading."""
         return self.group > before.group or self.machine > before.machine
-
-
-def _group_events() -> Path:
-    try:
-        lines = Path("/proc/self/cgroup").read_text().splitlines()
-    except OSError:
-        return Path("/nonexistent")
-    for line in lines:
-        if line.startswith("0::"):
-            return Path("/sys/fs/cgroup") / line[3:].strip().lstrip("/") / "memory.events"
-    return Path("/sys/fs/cgroup/memory/memory.oom_control")
 
 
 def _counter(file: Path, name: str) -> int:

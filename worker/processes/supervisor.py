@@ -100,10 +100,10 @@ class Supervisor:
             while not self._stopping:
                 self.look()
                 time.sleep(POLL)
-            self.stop()
         except _StopRequested:
             logger.info("stopped while starting")
         finally:
+            self.stop()
             for number, handler in handlers.items():
                 signal.signal(number, handler)
 
@@ -113,7 +113,7 @@ class Supervisor:
         for each in self._running:
             if each.process is None:
                 if now >= each.restart_at:
-                    self._launch(each)
+                    self._launch_again(each, now)
             elif (code := each.process.poll()) is not None:
                 each.pause = FIRST_PAUSE if now - each.began > GROWN_UP else min(2 * each.pause, LONGEST_PAUSE)
                 each.process, each.restart_at = None, now + each.pause
@@ -148,6 +148,14 @@ class Supervisor:
         if self._starting:
             self._starting = False
             raise _StopRequested
+
+    def _launch_again(self, each: _Running, now: float) -> None:
+        try:
+            self._launch(each)
+        except OSError as error:  # out of processes, memory or descriptors: the other children keep running
+            each.pause = min(2 * each.pause, LONGEST_PAUSE)
+            each.restart_at = now + each.pause
+            logger.warning("%s cannot be started: %s. Trying again in %.1f s", each.child.name, error, each.pause)
 
     def _launch(self, each: _Running) -> None:
         child, parent = each.child, os.getpid()

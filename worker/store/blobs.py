@@ -135,7 +135,7 @@ class Blobs:
                 raise InvalidSetting("PLIANT_BLOB_URL", expected=expected, got=repr(url)) from None
 
     def put(self, key: str, file: Path, *, media_type: str = "application/octet-stream") -> int:
-        """Store a file atomically; return its size in bytes.
+        """Store a file atomically and durably; return its size in bytes.
 
         A local store links the file if possible instead of copying it: do not write to it afterwards. A remote store also keeps
         the media type, and the last part of the key as the file name, for downloads through `Blob.link`.
@@ -148,11 +148,13 @@ class Blobs:
             self._call(
                 lambda: obstore.put(self._store, key, file, attributes=shown), seconds=ANSWER_WITHIN + size / SLOWEST
             )
+        self._write_to_disk(local)
         return size
 
     def write(self, key: str, data: bytes) -> None:
-        """Store bytes atomically."""
+        """Store bytes atomically and durably."""
         self._call(lambda: obstore.put(self._store, key, data), seconds=ANSWER_WITHIN + len(data) / SLOWEST)
+        self._write_to_disk(self._local(key))
 
     @property
     def remote(self) -> bool:
@@ -196,7 +198,7 @@ class Blobs:
                 out.write(chunk)
 
     def copy(self, key: str, to: str) -> None:
-        """Copy within the store.
+        """Copy within the store, durably.
 
         Raises
         ------
@@ -204,6 +206,7 @@ class Blobs:
             There is no file under this key.
         """
         self._call(lambda: obstore.copy(self._store, key, to))
+        self._write_to_disk(self._local(to))
 
     def delete(self, prefix: str) -> None:
         """Remove one file, or all files under a prefix that ends with a slash; missing ones are ignored."""
@@ -223,6 +226,18 @@ class Blobs:
     def check(self) -> None:
         """Return normally if the store answers."""
         self._call(lambda: obstore.list_with_delimiter(self._store, "jobs-that-never-are"))
+
+    def _write_to_disk(self, file: Path | None) -> None:
+        """Write a local file and the directories that lead to it to the disk, so that a power failure cannot lose or empty it."""
+        if file is None:
+            return
+        with answering():
+            for path in (file, *(each for each in file.parents if each.is_relative_to(self.directory or file))):
+                descriptor = os.open(path, os.O_RDONLY)
+                try:
+                    os.fsync(descriptor)
+                finally:
+                    os.close(descriptor)
 
     def _local(self, key: str) -> Path | None:
         """Return the path of a key; None if the store is remote or the key is invalid."""

@@ -468,6 +468,7 @@ def test_a_token_is_only_sent_in_the_header(clock: Clock) -> None:
         ("5", 5.0),
         ("soon", None),
         ("-3", None),
+        ("²", None),
         ("Wed, 21 Oct 2015 07:28:00 GMT", 0.0),
         ("Wed, 21 Oct 2015 07:28:00 -0000", 0.0),
     ],

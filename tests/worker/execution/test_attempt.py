@@ -14,7 +14,7 @@ import pytest
 from pliant.schemas.job import Artifact, Interpretation, Progress, Status
 from pliant.schemas.options import Options
 from pliant.worker.errors import Interrupted, StoreUnavailable
-from pliant.worker.execution.attempt import Attempt, run, work
+from pliant.worker.execution.attempt import Attempt, limited_memory, run, work
 from pliant.worker.execution.failures import problem_of
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.finished import Finished
@@ -74,6 +74,32 @@ def test_a_cancel_is_noticed_within_a_quarter_of_a_second(jobs: Jobs, attempt: A
     assert stopped[0] == pytest.approx(0.25)
     attempt.conclude(None)
     assert jobs.get(attempt.id).status is Status.CANCELLED
+
+
+def test_a_store_that_hangs_slows_a_job_down_by_at_most_a_quarter(
+    attempt: Attempt, now: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def hang(*_: object, **__: object) -> None:
+        now[0] += 7.0
+        raise StoreUnavailable("The job store", reason="TimeoutError")
+
+    monkeypatch.setattr(type(attempt.jobs.records), "look", hang)
+    monkeypatch.setattr(type(attempt.jobs.records), "update", hang)
+    attempt.deadline = 1e6
+    for _ in range(20_000):  # steps of 10 ms
+        now[0] += 0.01
+        attempt.report(Progress(stage="reweight", fraction=0.5, updated_at=datetime.now(UTC)))
+        assert not attempt.should_stop()
+    assert 200 < now[0] < 200 * 1.25 + 7
+
+
+def test_a_limit_of_memory_that_the_system_lacks_is_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise ValueError("current limit exceeds maximum limit")
+
+    monkeypatch.setattr("pliant.worker.execution.attempt.resource.setrlimit", refuse)
+    with limited_memory(1 << 35):
+        pass
 
 
 def test_an_attempt_stops_at_its_time_limit(attempt: Attempt, now: list[float]) -> None:

@@ -165,13 +165,15 @@ def test_inputs_include_their_cost_estimate(tmp_path: Path) -> None:
 def test_memory_for_a_job_is_its_limit_or_its_share_of_the_machine(tmp_path: Path) -> None:
     group = tmp_path / "memory.max"
     group.write_text("max\n")
-    physical = memory_for_a_job(Settings(), group=group)
+    physical = memory_for_a_job(Settings(), groups=[group])
     assert physical == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     group.write_text("3000000000\n")
-    assert memory_for_a_job(Settings(), group=group) == 3_000_000_000
-    assert memory_for_a_job(Settings(workers=3), group=group) == 1_000_000_000
-    assert memory_for_a_job(Settings(memory_limit=2 << 30), group=group) == (2 << 30) - UNUSED
-    assert memory_for_a_job(Settings(), group=tmp_path / "none") == physical
+    assert memory_for_a_job(Settings(), groups=[group]) == 3_000_000_000
+    assert memory_for_a_job(Settings(workers=3), groups=[group]) == 1_000_000_000
+    (around := tmp_path / "around.max").write_text("2000000000\n")
+    assert memory_for_a_job(Settings(), groups=[group, around]) == 2_000_000_000
+    assert memory_for_a_job(Settings(memory_limit=2 << 30), groups=[group]) == (2 << 30) - UNUSED
+    assert memory_for_a_job(Settings(), groups=[tmp_path / "none"]) == physical
 
 
 @pytest.fixture

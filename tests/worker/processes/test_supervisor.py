@@ -75,6 +75,38 @@ def test_ended_children_are_restarted_with_growing_pauses(tmp_path: Path) -> Non
     assert gone(steady)
 
 
+def test_a_child_that_cannot_be_started_again_is_tried_later_and_leaves_the_others_running(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    supervisor = Supervisor([python("short", "raise SystemExit(3)"), python("steady", SLEEP)])
+    supervisor.start()
+    start, steady = subprocess.Popen, supervisor.pids()["steady"]
+
+    def no_process(*_: object, **__: object) -> None:
+        raise BlockingIOError("Resource temporarily unavailable")
+
+    monkeypatch.setattr(subprocess, "Popen", no_process)
+    until(lambda: supervisor.look() or "cannot be started" in caplog.text)
+    assert "short cannot be started: Resource temporarily unavailable. Trying again in 0.8 s" in caplog.text
+    assert not gone(steady)
+    monkeypatch.setattr(subprocess, "Popen", start)
+    until(lambda: supervisor.look() or "short" in supervisor.pids())
+    supervisor.stop()
+
+
+def test_an_unexpected_error_stops_the_children(monkeypatch: pytest.MonkeyPatch) -> None:
+    supervisor, started = Supervisor([python("steady", SLEEP)]), dict[str, int]()
+
+    def fail() -> None:
+        started.update(supervisor.pids())
+        raise ValueError("a fault of the supervisor")
+
+    monkeypatch.setattr(supervisor, "look", fail)
+    with pytest.raises(ValueError, match="a fault"):
+        supervisor.run()
+    assert gone(started["steady"])
+
+
 def test_children_stop_before_foundations_and_are_killed_after_their_grace(tmp_path: Path) -> None:
     log = tmp_path / "ends"
     polite = (

@@ -51,6 +51,24 @@ def test_a_stored_file_is_read_back(blobs: Blobs, file: Path, tmp_path: Path) ->
     assert (tmp_path / "copy").read_bytes() == content
 
 
+def test_files_of_a_local_store_are_on_the_disk_before_they_are_named(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A record survives a power failure; the file that it names must, too."""
+    blobs, synced = Blobs.open((tmp_path / "store").as_uri()), set[int]()
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.add(os.fstat(descriptor).st_ino))
+    blobs.put("jobs/a/inputs.npz", file)
+    blobs.write("jobs/b/part", b"bytes")
+    blobs.copy("jobs/a/inputs.npz", "jobs/c/inputs.npz")
+    store = tmp_path / "store"
+    names = [
+        store,
+        store / "jobs",
+        *(store / "jobs" / each for each in ("a/inputs.npz", "a", "b/part", "b", "c", "c/inputs.npz")),
+    ]
+    assert synced == {path.stat().st_ino for path in names}
+
+
 @pytest.mark.parametrize(("start", "end"), [(-1, None), (0, 2_560_001), (5, 4), (2_560_001, None)])
 def test_a_range_outside_the_file_is_refused(file: Path, start: int, end: int | None) -> None:
     blobs = Blobs.open("memory:///")
