@@ -1,4 +1,4 @@
-"""The assembly of the application: routes, middleware and the table of errors."""
+"""The assembly of the application: routes, middleware and the handlers of errors."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ from pliant.service.routes import metrics as metrics_route
 from pliant.service.settings import ServiceSettings
 from pliant.service.spool import Incoming, ParserSlots
 from pliant.service.upload_locks import UploadLocks
-from pliant.worker import errors
-from pliant.worker.formats import InvalidInput, Limits
+from pliant.worker.formats import Limits
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.records import Records
 from pliant.worker.tokens import Tokens
@@ -39,27 +38,6 @@ ROUTES = (
     jobs, outputs, shares, inspection, uploads, artifacts, events, meta, metrics_route, examples, error_pages,
 )  # fmt: skip
 """In the order of the API reference."""
-
-STATUS_OF: dict[type[Exception], int] = {
-    InvalidInput: 422,
-    errors.UnknownJob: 404,
-    errors.UnknownArtifact: 404,
-    errors.UnknownExample: 404,
-    errors.UnknownShare: 404,
-    errors.UnknownToken: 404,
-    errors.UnknownUpload: 404,
-    errors.NotAllowedNow: 409,
-    errors.Conflict: 409,
-    errors.InvalidRequest: 422,
-    errors.UploadTooLarge: 413,
-    errors.TooManyShares: 409,
-    errors.TooManyUploads: 429,
-    errors.TooManyQueued: 429,
-    errors.QuotaExceeded: 507,
-    errors.StoreUnavailable: 503,
-    errors.WorkerError: 500,
-}
-"""HTTP status of each error; a subclass that is not listed uses its nearest base's."""
 
 
 def create_app(
@@ -86,7 +64,7 @@ def create_app(
         redirect_slashes=False,  # behind a proxy, the absolute address of such a redirect would be that of plain http
     )
     routes = [route for each in ROUTES for route in each.router.routes]
-    problems.install(app, STATUS_OF, routes=routes, security_headers=SECURITY_HEADERS)
+    problems.install(app, routes=routes, security_headers=SECURITY_HEADERS)
     for each in ROUTES:
         app.include_router(each.router, dependencies=[Depends(known_parameters)])
     mount_page(app)

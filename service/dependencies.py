@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from fastapi import Depends, Request
 from fastapi.routing import APIRoute
@@ -19,6 +20,8 @@ from pliant.worker.formats import Limits
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.tokens import Token
 from pliant.worker.uploads.service import Uploads
+
+Answer = TypeVar("Answer")
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,16 @@ def my_uploads(request: Request) -> Uploads:
     return service_of(request).uploads.of(request.scope.get("pliant.owner") or "")
 
 
-Core = Annotated[Service, Depends(service_of)]
-Mine = Annotated[Jobs, Depends(mine)]
-MyUploads = Annotated[Uploads, Depends(my_uploads)]
-Bound = Annotated[Bounds, Depends(bounds_of)]
+def _at_once(part: Callable[[Request], Answer]) -> Callable[[Request], Awaitable[Answer]]:
+    """Return the function as a dependency that needs no thread: calls of the store may occupy all of them."""
+
+    async def dependency(request: Request) -> Answer:
+        return part(request)
+
+    return dependency
+
+
+Core = Annotated[Service, Depends(_at_once(service_of))]
+Mine = Annotated[Jobs, Depends(_at_once(mine))]
+MyUploads = Annotated[Uploads, Depends(_at_once(my_uploads))]
+Bound = Annotated[Bounds, Depends(_at_once(bounds_of))]

@@ -1,6 +1,6 @@
 """The conversion of every error to RFC 9457 problem details.
 
-A table maps each class of exception to a status code; code, field, expected, got and hint are attributes of the exception.
+The error's code determines the status; code, field, expected, got and hint are attributes of the exception.
 FastAPI's own errors (404, 405, 422) are converted the same way, so a client needs one parser.
 """
 
@@ -18,8 +18,10 @@ from fastapi.responses import Response
 from pliant.schemas.invalid import Invalid, members_of
 from pliant.schemas.job import Problem
 from pliant.schemas.option_faults import option_fault, shown
-from pliant.schemas.problems import ProblemCode
+from pliant.schemas.problems import ProblemCode, find_code
 from pliant.schemas.validation import expectation
+from pliant.worker.errors import WorkerError
+from pliant.worker.formats import InvalidInput
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
@@ -31,12 +33,8 @@ MEDIA_TYPE = "application/problem+json"
 _log = logging.getLogger("pliant.service")
 
 _BY_STATUS = {
-    400: (ProblemCode.BAD_REQUEST, "The request could not be read. Compare it with the example at /docs."),
-    401: (ProblemCode.UNAUTHORIZED, "Send a token as `Authorization: Bearer …`."),
     404: (ProblemCode.NO_SUCH_ADDRESS, "No route has this path. All paths are listed at /docs."),
     405: (ProblemCode.METHOD_NOT_ALLOWED, "This path does not support this method. The methods are listed at /docs."),
-    413: (ProblemCode.BODY_TOO_LARGE, "Send a smaller body; the limits are at /v1/limits."),
-    415: (ProblemCode.UNSUPPORTED_MEDIA_TYPE, "Send multipart/form-data or application/json; see /docs."),
     500: (ProblemCode.INTERNAL_ERROR, "The service failed; its log has the details. Report it if it happens again."),
 }
 
@@ -117,10 +115,15 @@ def answer(
     return ProblemResponse(Problem.of(code, status, detail=detail, **members), headers=headers)
 
 
-def from_error(error: Exception, status: int) -> Problem:
-    """Return the problem of a worker's or reader's error, with its code, field, expected, got, hint and choices."""
-    code = str(getattr(error, "code", ProblemCode.INTERNAL_ERROR))
-    return Problem.of(code, status, detail=str(error), **members_of(error))
+def of_error(error: WorkerError | InvalidInput) -> ProblemResponse:
+    """Return the response for a worker's or reader's error, with its code, field, expected, got, hint and choices."""
+    code = find_code(error.code)
+    status = None if code is None else code.status
+    if status is None:
+        status = 422 if isinstance(error, Invalid) else 500
+    after = getattr(error, "retry_after", None)
+    problem = Problem.of(error.code, status, detail=str(error), **members_of(error))
+    return ProblemResponse(problem, headers=None if after is None else {"Retry-After": str(after)})
 
 
 def from_validation(errors: Sequence[Any], *, options: bool = False) -> Refusal:
@@ -142,17 +145,11 @@ def from_validation(errors: Sequence[Any], *, options: bool = False) -> Refusal:
     )  # fmt: skip
 
 
-def install(
-    app: FastAPI,
-    table: Mapping[type[Exception], int],
-    *,
-    routes: Sequence[BaseRoute],
-    security_headers: Mapping[str, str],
-) -> None:
+def install(app: FastAPI, *, routes: Sequence[BaseRoute], security_headers: Mapping[str, str]) -> None:
     """Answer every error of the app with a problem document.
 
-    `table` maps error classes to status codes; a subclass that is not listed uses its nearest base's. `routes` are those whose methods
-    the header `Allow` lists. `security_headers` are for the response to an unexpected exception, which is created outside all middleware.
+    `routes` are those whose methods the header `Allow` lists. `security_headers` are for the response to an unexpected exception, which
+    is created outside all middleware.
     """
     app.add_exception_handler(Refusal, _of_refusal)
     paths = [route for route in routes if isinstance(route, Route)]
@@ -161,8 +158,8 @@ def install(
     app.add_exception_handler(ClientDisconnect, _of_disconnect)
     app.add_exception_handler(OSError, partial(_of_disk, security_headers=security_headers))
     app.add_exception_handler(Exception, partial(_unforeseen, security_headers=security_headers))
-    for kind in table:
-        app.add_exception_handler(kind, partial(_of_ours, table=table))
+    for kind in (WorkerError, InvalidInput):
+        app.add_exception_handler(kind, _of_ours)
 
 
 async def _of_refusal(_: Request, error: Exception) -> Response:
@@ -196,13 +193,12 @@ async def _of_disconnect(_: Request, __: Exception) -> Response:
     )
 
 
-async def _of_ours(_: Request, error: Exception, table: Mapping[type[Exception], int]) -> Response:
-    status = next(table[base] for base in type(error).__mro__ if base in table)
-    if status >= 500:
-        _log.error("%s: %s", type(error).__name__, error, exc_info=error if status == 500 else None)
-    after = getattr(error, "retry_after", None)
-    headers = None if after is None else {"Retry-After": str(after)}
-    return ProblemResponse(from_error(error, status), headers=headers)
+async def _of_ours(_: Request, error: Exception) -> Response:
+    assert isinstance(error, (WorkerError, InvalidInput))
+    found = of_error(error)
+    if found.status_code >= 500:
+        _log.error("%s: %s", type(error).__name__, error, exc_info=error if found.status_code == 500 else None)
+    return found
 
 
 async def _of_disk(request: Request, error: Exception, security_headers: Mapping[str, str]) -> Response:

@@ -11,7 +11,7 @@ from anyio import to_thread
 from fastapi.responses import Response
 from pliant.schemas.problems import ProblemCode
 from pliant.service.middleware.share_links import authorize_share, bearer_of, share_of
-from pliant.service.problems import ProblemResponse, answer, from_error
+from pliant.service.problems import answer, of_error
 from pliant.service.settings import ServiceSettings
 from pliant.worker.errors import StoreUnavailable, UnknownToken
 from pliant.worker.records import Records, utc_now
@@ -103,7 +103,7 @@ class Authentication:
         try:
             found = await self._authorize(scope)
         except StoreUnavailable as error:
-            found = ProblemResponse(from_error(error, 503), headers={"Retry-After": "2"})
+            found = of_error(error)
         if isinstance(found, Response):
             await found(scope, receive, send)
             return

@@ -8,7 +8,7 @@ from anyio import to_thread
 from fastapi.responses import Response
 from pliant.schemas.problems import ProblemCode
 from pliant.schemas.shares import SHARE_PREFIX
-from pliant.service.problems import ProblemResponse, answer, from_error
+from pliant.service.problems import answer, of_error
 from pliant.worker.errors import StoreUnavailable
 from pliant.worker.jobs.sharing import recognise_share
 from pliant.worker.records import Records, utc_now
@@ -37,7 +37,7 @@ async def authorize_share(scope: Scope, token: str, records: Records) -> Respons
     try:
         found = await to_thread.run_sync(recognise_share, records, token)
     except StoreUnavailable as error:
-        return ProblemResponse(from_error(error, 503), headers={"Retry-After": "2"})
+        return of_error(error)
     if found is None:
         detail = "This share link is not valid: it was revoked, or its job was deleted. Ask its sender for a new one."
         return _refused(ProblemCode.INVALID_SHARE, detail)

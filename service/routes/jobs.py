@@ -34,7 +34,7 @@ _KeyHeader = Annotated[
 ]
 
 
-def idempotency_key(request: Request, key: _KeyHeader = None) -> str | None:
+async def idempotency_key(request: Request, key: _KeyHeader = None) -> str | None:
     """Return the `Idempotency-Key`, as UTF-8 if it is; several are refused, because each could stand for another job."""
     if len(request.headers.getlist("idempotency-key")) > 1:
         detail = "The header Idempotency-Key was sent more than once. Send one key."
@@ -50,7 +50,7 @@ def idempotency_key(request: Request, key: _KeyHeader = None) -> str | None:
 Key = Annotated[str | None, Depends(idempotency_key)]
 
 
-def preferences(
+async def preferences(
     request: Request,
     prefer: Annotated[
         str | None,

@@ -16,11 +16,13 @@ import anyio
 import httpx
 import pytest
 from pliant.schemas.job import Status
-from pliant.service.app import STATUS_OF, create_app
+from pliant.service.app import create_app
+from pliant.service.problems import of_error
 from pliant.service.settings import MB
 from pliant.service.spool import Incoming
 from pliant.worker import errors
 from pliant.worker.errors import InvalidSetting, StoreUnavailable
+from pliant.worker.formats import InvalidInput
 from pliant.worker.formats.records import Limits
 from pliant.worker.records import EVENTS_KEPT_AT_LAST, utc_now
 from pliant.worker.store.blobs import Blobs
@@ -321,10 +323,20 @@ def test_a_job_can_be_deleted_while_the_blob_store_is_down(
     assert set(running.jobs.records.deleted()) >= {id}, "the reconciler removes the files later"
 
 
-def test_every_worker_error_has_a_status() -> None:
-    kinds = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, errors.WorkerError)]
-    assert len(kinds) > 8
-    assert all(any(base in STATUS_OF for base in kind.__mro__) for kind in kinds)
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (errors.UnknownJob("a"), 404),
+        (errors.InvalidRequest("invalid_id", field="id", expected="letters", got="?", hint="Change it."), 422),
+        (errors.StoreUnavailable("The job store", reason="no answer"), 503),
+        (errors.WorkerError("The worker failed."), 500),
+        (InvalidInput("invalid_argument", field="frames", expected="3", got="2", hint="Add one."), 422),
+    ],
+)
+def test_an_errors_code_determines_the_status(error: errors.WorkerError | InvalidInput, status: int) -> None:
+    answer = of_error(error)
+    assert answer.status_code == status
+    assert ("retry-after" in answer.headers) == (status == 503)
 
 
 def test_requests_time_out_and_health_checks_pass_if_the_store_hangs(

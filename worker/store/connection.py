@@ -53,9 +53,10 @@ class _Pipeline(Pipeline):
 def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | None = None) -> redis.Redis:
     """Return a client that connects on first use. Its replies are text if `decode` is True, else bytes, which RQ needs.
 
-    After a broken connection it retries with growing pauses of up to 0.5 s. All writes are compare-and-set or idempotent, so a
-    retry after a lost reply is harmless. Timeouts are not retried, since that would multiply the wait. `answer_within` is the time
-    limit of a command, seconds; None: `ANSWER_WITHIN`, and `SilentServer` limits the commands sent to a silent server.
+    After a broken connection it retries with growing pauses of up to 0.5 s. Changes of records are compare-and-set or idempotent, so a
+    retry after a lost reply is harmless. Lines of a log may appear twice, and a webhook that was leased unnoticed is sent when the lease
+    ends. Timeouts are not retried, since that would multiply the wait. `answer_within` is the time limit of a command, seconds; None:
+    `ANSWER_WITHIN`, and `SilentServer` limits the commands sent to a silent server.
 
     Raises
     ------
