@@ -168,7 +168,10 @@ def verdict_lines(result: Job | Finished) -> list[Text]:
     if result.verdict is None:
         return []
     words, colour = _verdict(result)
-    sentences = " ".join(sentence for sentence in (result.trust_sentence, result.sentence) if sentence is not None)
+    trust = result.trust_sentence
+    if trust is not None and trust.startswith(UNESTIMATED):  # as `words` say
+        trust = trust.removeprefix(UNESTIMATED).lstrip("; ").capitalize()
+    sentences = " ".join(sentence for sentence in (trust, result.sentence) if sentence)
     return [Text.assemble((words, f"bold {colour}"), f"  {sentences}")] + [
         Text(f"  {reason}") for reason in result.verdict_reasons
     ]
