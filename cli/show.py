@@ -211,7 +211,12 @@ def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
 
 def needs(estimate: Estimate) -> str:
     """Return estimated memory and time in words."""
-    return f"about {estimate.memory_bytes / 1e9:.1f} GB of memory, {estimate.seconds:,.0f} s on one core"
+    return f"about {in_gigabytes(estimate)} of memory, {estimate.seconds:,.0f} s on one core"
+
+
+def in_gigabytes(estimate: Estimate) -> str:
+    """Return the estimated memory with its unit."""
+    return f"{estimate.memory_bytes / 1e9:.1f} GB"
 
 
 def metrics_table(metrics: Mapping[str, float]) -> Table:
