@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pliant.cli.session import LINE_EVERY
-from pliant.cli.show import err, needs, out, show_warnings
+from pliant.cli.show import err, in_gigabytes, out, show_warnings
 
 if TYPE_CHECKING:
     from pliant.schemas.job import Estimate
@@ -90,7 +90,8 @@ def warnings_of_check(facts: FilmFacts, region: Path | None, options: Options) -
     """Return the tracker's warnings that are known from a film's check."""
     from pliant.tracking.advice import warnings_unread
 
-    return warnings_unread(whole=region is None and options.region_polygon is None, frames=facts.frames)
+    whole = region is None and options.region_polygon is None
+    return warnings_unread(whole=whole, region_frame=options.region_frame, frames=facts.frames)
 
 
 def film_rows(facts: FilmFacts, options: Options, estimate: Estimate | None) -> list[tuple[str, str]]:
@@ -116,10 +117,10 @@ def film_rows(facts: FilmFacts, options: Options, estimate: Estimate | None) -> 
             ("pixels", f"{facts.pixel_aspect:.4g} times as wide as high; frames are stretched to the size above")
         )
     rows.append(("points", f"about {facts.points}" if facts.points else "none: no texture in the region"))
-    if facts.track_seconds:
-        rows.append(("tracking", f"about {facts.track_seconds:.0f} s on this machine"))
     if estimate is not None:
-        rows.append(("reconstruction", needs(estimate)))
+        tracking, solving = facts.track_seconds, estimate.seconds
+        parts = f"tracking {tracking:,.0f} s, reconstruction {solving:,.0f} s on one core"
+        rows += [("time", f"about {tracking + solving:,.0f} s: {parts}"), ("memory", f"about {in_gigabytes(estimate)}")]
     return rows
 
 

@@ -168,7 +168,10 @@ def verdict_lines(result: Job | Finished) -> list[Text]:
     if result.verdict is None:
         return []
     words, colour = _verdict(result)
-    sentences = " ".join(sentence for sentence in (result.trust_sentence, result.sentence) if sentence is not None)
+    trust = result.trust_sentence
+    if trust is not None and trust.startswith(UNESTIMATED):  # as `words` say
+        trust = trust.removeprefix(UNESTIMATED).lstrip("; ").capitalize()
+    sentences = " ".join(sentence for sentence in (trust, result.sentence) if sentence)
     return [Text.assemble((words, f"bold {colour}"), f"  {sentences}")] + [
         Text(f"  {reason}") for reason in result.verdict_reasons
     ]
@@ -208,7 +211,12 @@ def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
 
 def needs(estimate: Estimate) -> str:
     """Return estimated memory and time in words."""
-    return f"about {estimate.memory_bytes / 1e9:.1f} GB of memory, {estimate.seconds:,.0f} s on one core"
+    return f"about {in_gigabytes(estimate)} of memory, {estimate.seconds:,.0f} s on one core"
+
+
+def in_gigabytes(estimate: Estimate) -> str:
+    """Return the estimated memory with its unit."""
+    return f"{estimate.memory_bytes / 1e9:.1f} GB"
 
 
 def metrics_table(metrics: Mapping[str, float]) -> Table:

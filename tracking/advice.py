@@ -25,21 +25,25 @@ UNEVEN = 1.5
 """Ratio of longest to median time between frames above which the rate counts as variable."""
 
 
-def warnings_unread(*, whole: bool = False, frames: int = 0) -> list[str]:
+def warnings_unread(*, whole: bool = False, region_frame: int = 0, frames: int = 0) -> list[str]:
     """Return the warnings that need no look at the pictures: `whole` if there is no region, `frames` to track, 0 if unknown."""
     notes = []
     if whole:
         notes.append(
             "No region was given, so everything in the picture is tracked, background included. Draw around the object."
         )
+    if whole and region_frame != 0:
+        notes.append("region_frame has no effect without a region.")
     if 0 < frames < FEW_FRAMES:
         notes.append(f"Only {frames} frames are tracked. Film two seconds or more, while the object turns.")
     return notes
 
 
-def warnings_before(film: Film, found: Survey, start: int, stop: int, *, whole: bool, rough: float) -> list[str]:
+def warnings_before(
+    film: Film, found: Survey, start: int, stop: int, *, whole: bool, rough: float, region_frame: int = 0
+) -> list[str]:
     """Return warnings about the film in rows `start` to `stop`: region, shots, length, frame rate, and texture in a share `rough`."""
-    notes = warnings_unread(whole=whole)
+    notes = warnings_unread(whole=whole, region_frame=region_frame)
     if found.cuts:
         count, first = len(found.cuts), found.indices[found.cuts[0]]
         cuts = f"a cut (at frame {first})" if count == 1 else f"{count} cuts (the first at frame {first})"

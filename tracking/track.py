@@ -119,19 +119,21 @@ def track_film(
     with opencv_serial(), FrameStore() as store, ThreadPoolExecutor(workers) as pool:
         run = Run(opened, store, pool, on_step or (lambda _: None), stop, on_warnings or (lambda _: None))
         mask = None if region is None else read_region(region, opened.size)
-        run.on_warnings(warnings_unread(whole=region is None))
+        run.on_warnings(warnings_unread(whole=region is None, region_frame=region_frame))
         reached = None if region is None else region_frame
         found = survey(opened, store, reached=reached, longest_side=longest_side, on_step=run.on_step, should_stop=stop)
         step = None if grid_step is None else grid_step * tracking_scale(opened.size, longest_side)
         plan = plan_of(run, found, mask, region_frame=region_frame, template_frame=template_frame)
-        return _track(run, found, plan, step, whole=region is None)
+        return _track(run, found, plan, step, whole=region is None, region_frame=region_frame)
 
 
-def _track(run: Run, found: Survey, plan: Plan, step: float | None, *, whole: bool) -> TrackedFilm:
+def _track(run: Run, found: Survey, plan: Plan, step: float | None, *, whole: bool, region_frame: int) -> TrackedFilm:
     """Seed, chain, track again, drop points visible in few frames, and assemble the result."""
     template = run.store.read(plan.template)
     seeds, textured = _placed(template, plan, step)
-    notes = warnings_before(run.film, found, plan.start, plan.stop, whole=whole, rough=textured)
+    notes = warnings_before(
+        run.film, found, plan.start, plan.stop, whole=whole, region_frame=region_frame, rough=textured
+    )
     run.on_warnings(notes)
     appearance = Appearance.of(template, plan.mask, seeds.points, neighbours(seeds.grid, len(seeds.points)))
     fine = Registration.of(template, seeds.points, seeds.grid, noise=appearance.noise)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import films
@@ -100,13 +101,17 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
         "frames 5 of 10",
         "rate 15 frames per second",
         "rotation 90°, applied",
-        "tracking about",
-        "reconstruction about",
     ):
         assert each in words
+    times = r"time about (\d+) s: tracking (\d+) s, reconstruction (\d+) s on one core memory about \d\.\d GB"
+    ((total, tracking, solving),) = re.findall(times, words)
+    assert abs(int(total) - int(tracking) - int(solving)) <= 1  # each is rounded
     assert read["warnings"] == []
     assert [each[:19] for each in everything["warnings"]] == ["No region was given"]
     assert "warning No region was given" in words
+    assert "warning region_frame has no effect without a region." in " ".join(
+        inspect(film, "-O", "region_frame=3").output.split()
+    )
     assert "warning Only 5 frames are tracked." in words
     assert "warning" not in inspect(film, "-O", "region_polygon=[[20,20],[70,20],[70,55]]").output
     assert "note Not used for films: layout." in " ".join(inspect(film, "-O", "layout=points_frames").output.split())

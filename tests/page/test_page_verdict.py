@@ -90,7 +90,8 @@ def test_a_good_verdict_without_an_error_estimate_does_not_read_like_a_plain_one
     page.goto(f"{url}/#job={finished}")
     badge = page.get_by_role("region", name="Verdict").locator(".badge")
     expect(badge).to_have_text("Good, error not estimated")
-    expect(page.get_by_role("region", name="Verdict")).to_contain_text("depth rests on 63° of turn.")
+    expect(page.get_by_role("region", name="Verdict")).to_contain_text("Depth rests on 63° of turn.")
+    expect(page.get_by_role("region", name="Verdict")).not_to_contain_text("The error is not estimated")
     page.get_by_role("heading", name="Jobs").click()
     expect(page.locator(f'a[href="#job={finished}"]')).to_contain_text("Good, error not estimated")
     colour = "(it) => getComputedStyle(it).backgroundColor"

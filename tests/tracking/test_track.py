@@ -209,13 +209,19 @@ def test_without_a_region_the_whole_picture_is_tracked_with_a_warning(tmp_path: 
     behind, before = (films.textured_pictures(8, (96, 72), seed=seed) for seed in (0, 7))
     for number, (picture, thing) in enumerate(zip(behind, before, strict=True)):
         picture[20 + number : 50 + number, 30:70] = thing[20:50, 30:70]  # moves down, the background to the right
-    tracked = track_film(films.write_film(tmp_path / "film.mkv", behind), grid_step=6)
+    told: list[list[str]] = []
+    path = films.write_film(tmp_path / "film.mkv", behind)
+    tracked = track_film(path, grid_step=6, region_frame=3, on_warnings=told.append)
     assert 8 // 3 <= tracked.template < 8 - 8 // 3
     assert np.ptp(tracked.tracks[tracked.template], axis=0).min() > 50
-    assert tracked.warnings[:2] == (
+    assert tracked.warnings[:3] == (
         "No region was given, so everything in the picture is tracked, background included. Draw around the object.",
+        "region_frame has no effect without a region.",
         "Only 8 frames are tracked. Film two seconds or more, while the object turns.",
     )
+    assert [each[:2] for each in told] == [list(tracked.warnings[:2])] * len(
+        told
+    )  # whoever prints the new ones repeats none
 
 
 def test_a_selection_keeps_the_films_frame_numbers(turning: tuple[Path, RenderedFilm]) -> None:

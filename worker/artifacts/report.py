@@ -110,8 +110,8 @@ def _size_sentence(scales: Floats) -> str:
     if change < 1:
         return ""
     return (
-        f" The object's size in the picture changes by {change} %, which is taken as a change of the camera's distance; an object that "
-        "grows or shrinks would look the same."
+        f" The object's size in the picture changes by {change} %. This is read as a change of the camera's distance; "
+        "a growing or shrinking object looks the same."
     )
 
 

@@ -25,6 +25,14 @@ function isUnestimated(job: Job): boolean {
   return job.trust_sentence?.startsWith(UNESTIMATED) ?? false;
 }
 
+/** Return the sentence on the expected error; without an estimate, which the badge states, only what depth rests on. */
+function trustOf(job: Job): string {
+  const sentence = job.trust_sentence ?? "";
+  if (!isUnestimated(job)) return sentence;
+  const rest = sentence.slice(UNESTIMATED.length).replace(/^; /, "");
+  return rest.charAt(0).toUpperCase() + rest.slice(1);
+}
+
 /** Return the badge of a verdict. */
 export function badge(verdict: Verdict, job: Job): HTMLElement {
   const [outline, sign] = ICONS[verdict];
@@ -71,7 +79,8 @@ export class VerdictBox {
     this.element.dataset["verdict"] = verdict;
     const reasons = job.verdict_reasons ?? [];
     fill(this.badge, headline(verdict, job), () => [badge(verdict, job)]);
-    fill(this.trust, job.trust_sentence ?? "", () => [unbroken(job.trust_sentence ?? "")]);
+    const trust = trustOf(job);
+    fill(this.trust, trust, () => [unbroken(trust)]);
     fill(this.reasons, reasons.join("\n"), () => reasons.map((reason) => h("li", {}, unbroken(reason))));
     fill(this.outcome, job.sentence ?? "", () => [job.sentence && `Solver: ${job.sentence}`]);
   }

@@ -76,8 +76,8 @@ def test_the_report_states_the_field_of_view(focal: float | None, std: float | N
     [
         (
             1.34,
-            "Scaled orthographic camera. The object's size in the picture changes by 34 %, which is taken as a change of the camera's "
-            "distance; an object that grows or shrinks would look the same.",
+            "Scaled orthographic camera. The object's size in the picture changes by 34 %. This is read as a change of the camera's "
+            "distance; a growing or shrinking object looks the same.",
         ),
         (1.004, "Scaled orthographic camera."),
     ],
