@@ -81,7 +81,7 @@ def up(
 
     settings, service = chosen(data, workers), ServiceSettings.from_environment()
     host = service.host if host is None else host
-    port = taken(host, service.port if port is None else port)
+    port = free_port(host, service.port if port is None else port)
     url = address(host, port)
     made_folder(settings.data, "--data")
     with ExitStack() as held:
@@ -142,7 +142,7 @@ def chosen(data: Path | None, workers: int | None) -> Settings:
     return settings
 
 
-def taken(host: str, port: int) -> int:
+def free_port(host: str, port: int) -> int:
     """Return the port if it is free, or a free one for 0.
 
     Raises

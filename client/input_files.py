@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pliant.client.errors import BadArgument
+from pliant.schemas.job import LONGEST_NAME
 from pliant.schemas.pictures import SUFFIXES, pictures_in
 
 Source = ArrayLike | Mapping[str, Any] | Path | str
@@ -27,9 +28,6 @@ EXPECTED = {
     "region": "the path of a mask picture, or an array (H, W)",
 }
 """What an input may be that is no array or dictionary of arrays."""
-
-LONGEST_NAME = 200
-"""Maximum length of a job's name, characters."""
 
 
 def tracks_file(tracks: Source, visible: ArrayLike | None, folder: Path) -> Path:

@@ -14,6 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 HEARTBEAT_SECONDS = 15.0
 """Seconds between two comments of an event stream in which nothing happens, unless the operator sets another period."""
 
+LONGEST_NAME = 200
+"""Maximum length of a job's name, characters."""
+
 LONGEST_KEY = 255
 """Maximum length of an idempotency key, characters."""
 

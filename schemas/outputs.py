@@ -7,9 +7,6 @@ from typing import Annotated, Literal
 from pliant.schemas.options import Chosen, Options, Outputs
 from pydantic import Field
 
-RESTATED = ("fps", "normals", "colours", "axes", "glb_quantized", "glb_motion")
-"""Options of a job that a request for further files may override."""
-
 
 class OutputRequest(Chosen):
     """Files to write from a stored result. Options that are null keep the job's values."""
@@ -28,5 +25,4 @@ class OutputRequest(Chosen):
 
     def applied_to(self, options: Options) -> Options:
         """Return the options of a job with the outputs and the overridden options of this request."""
-        stated = {name: getattr(self, name) for name in RESTATED if getattr(self, name) is not None}
-        return options.model_copy(update={"outputs": self.outputs, **stated})
+        return options.model_copy(update={name: value for name, value in self if value is not None})

@@ -42,14 +42,14 @@ class Metrics:
             registry=self.registry,
         )
         self.seconds = prometheus_client.Histogram(
-            "pliant_http_answer_seconds",
+            "pliant_http_request_duration_seconds",
             "Seconds until an answer begins, by method and route, without answers that waited for a job.",
             ["method", "route"],
             buckets=ANSWER_SECONDS,
             registry=self.registry,
         )
         self.active = prometheus_client.Gauge(
-            "pliant_http_under_way", "Requests in progress, event streams included.", registry=self.registry
+            "pliant_http_requests_in_progress", "Requests in progress, event streams included.", registry=self.registry
         )
 
     def count(self, method: str, route: str, *, status: int, seconds: float | None) -> None:

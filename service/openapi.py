@@ -6,7 +6,7 @@ from http import HTTPStatus
 from typing import Any
 
 from fastapi import FastAPI
-from pliant.schemas.job import Problem
+from pliant.schemas.job import LONGEST_NAME, Problem
 from pliant.schemas.options import Options
 from pliant.schemas.outputs import OutputRequest
 from pliant.schemas.problems import ProblemCode, type_of
@@ -138,7 +138,7 @@ SUBMIT_BODY: dict[str, Any] = {
                         "Options that determine how tracks were read, or how a film is tracked, are those of that job; for a film "
                         "they may be given again.",
                     },
-                    "name": {"type": "string", "maxLength": 200, "description": "A label of your own."},
+                    "name": {"type": "string", "maxLength": LONGEST_NAME, "description": "A label of your own."},
                     "webhook": {
                         "type": "string",
                         "format": "uri",

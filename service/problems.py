@@ -97,7 +97,7 @@ def wrong_input(code: ProblemCode, *, field: str, expected: str, got: str, hint:
 
 def refused(error: Invalid, **more: Any) -> Refusal:
     """Return the refusal for an error about an invalid value; `more` is passed to `Refusal`."""
-    return Refusal(ProblemCode[error.code.upper()], detail=str(error), **{**members_of(error), **more})
+    return Refusal(ProblemCode(error.code), detail=str(error), **{**members_of(error), **more})
 
 
 def answer(
@@ -136,7 +136,7 @@ def from_validation(errors: Sequence[Any], *, options: bool = False) -> Refusal:
     if options:
         fault = option_fault(first)
         hint = f"{fault.hint} Compare with the schema at /v1/options.{others}".strip()
-        code = ProblemCode[fault.code.upper()]
+        code = ProblemCode(fault.code)
         return wrong_input(code, field=fault.field, expected=fault.expected, got=fault.got, hint=hint)
     where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", "header")]
     return wrong_input(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
-from pliant.schemas.job import Interpretation, Job, Priority
+from pliant.schemas.job import LONGEST_NAME, Interpretation, Job, Priority
 from pliant.schemas.options import Options
 from pliant.schemas.problems import ProblemCode
 from pliant.schemas.suggestions import closest
@@ -48,8 +48,6 @@ READING = (
 """Options that determine how tracks are read; they cannot change for stored inputs, which have been read already."""
 OF_TRACKING = (*sorted(TRACKING_OPTIONS), "stride", "max_points", "min_seen")
 """Options that determine the tracks of a film; those of an earlier job are kept unless they are given again."""
-LONGEST_JOB_NAME = 200
-"""Maximum length of the user's label, characters."""
 
 
 def form_rules(settings: ServiceSettings, *, max_body_bytes: int) -> FormRules:
@@ -213,13 +211,13 @@ def with_uploads(form: Form, folder: Path, uploads: Uploads) -> Form:
             digest = uploads.take(id, path)
         except UnknownUpload as error:
             hint = f"PUT it to /v1/uploads/{id[:64]} first; uploads that are not used expire."
-            code = ProblemCode[error.code.upper()]
+            code = ProblemCode(error.code)
             raise wrong_input(
                 code, field=name, status=422, expected="the id of an upload", got=repr(id[:80]), hint=hint
             ) from error
         except Conflict as error:
             hint = "Send the rest first, from the offset that HEAD returns."
-            code = ProblemCode[error.code.upper()]
+            code = ProblemCode(error.code)
             raise wrong_input(
                 code, field=name, status=422, expected="a complete upload", got="an incomplete one", hint=hint
             ) from error
@@ -352,8 +350,8 @@ def _priority(text: str) -> Priority:
 def _name(text: str) -> str:
     """Return the user's label with runs of blanks and control characters replaced by single spaces."""
     name = one_line(text)
-    if len(name) > LONGEST_JOB_NAME:
-        expected = f"at most {LONGEST_JOB_NAME} characters"
+    if len(name) > LONGEST_NAME:
+        expected = f"at most {LONGEST_NAME} characters"
         code = ProblemCode.NAME_TOO_LONG
         raise wrong_input(code, field="name", expected=expected, got=str(len(name)), hint="Shorten it.")
     return name

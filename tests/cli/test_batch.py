@@ -16,7 +16,7 @@ from pliant.cli import app
 from pliant.cli.exits import Exit
 from pliant.cli.session import Session
 from pliant.client import BadArgument, Client, RemoteJob
-from pliant.client.input_files import LONGEST_NAME
+from pliant.schemas.job import LONGEST_NAME
 from pliant.service.testing import InMemoryService
 from typer.testing import CliRunner, Result
 

@@ -22,7 +22,7 @@ from pliant.cli.demo import GOOD, announced, judge, why
 from pliant.cli.session import Session, name_of, parse_options
 from pliant.cli.solve import file_or_word
 from pliant.client import BadArgument, Unreachable
-from pliant.client.input_files import LONGEST_NAME
+from pliant.schemas.job import LONGEST_NAME
 from pliant.service.settings import ServiceSettings
 from pliant.service.testing import InMemoryService
 from pliant.worker.processes.valkey import find_binary
@@ -62,10 +62,10 @@ def test_an_occupied_port_is_rejected_and_0_finds_a_free_one() -> None:
         holder.listen()
         port = holder.getsockname()[1]
         with pytest.raises(BadArgument, match=rf"Cannot listen on 127\.0\.0\.1 port {port}.*--port 0"):
-            up.taken("127.0.0.1", port)
-        assert 0 < up.taken("127.0.0.1", 0) != port
+            up.free_port("127.0.0.1", port)
+        assert 0 < up.free_port("127.0.0.1", 0) != port
     with pytest.raises(BadArgument, match=r"Cannot listen on 192\.0\.2\.1"):
-        up.taken("192.0.2.1", 8000)
+        up.free_port("192.0.2.1", 8000)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pliant.client import AsyncClient, BadArgument, Client, InvalidRequest, PliantError
-from pliant.client.input_files import LONGEST_NAME
+from pliant.schemas.job import LONGEST_NAME
 from pliant.service.testing import InMemoryService
 
 

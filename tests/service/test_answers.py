@@ -355,7 +355,12 @@ def test_requests_time_out_and_health_checks_pass_if_the_store_hangs(
         began = time.monotonic()
         for thread in threads:
             thread.start()
-        until(lambda: (running.app.state.service.metrics.registry.get_sample_value("pliant_http_under_way") or 0) > 40)
+        until(
+            lambda: (
+                (running.app.state.service.metrics.registry.get_sample_value("pliant_http_requests_in_progress") or 0)
+                > 40
+            )
+        )
         assert http.get("/healthz").status_code == 200
         assert len(answers) < 20, "it did not wait for a thread: 40 there are, and more than 40 were before it"
         for thread in threads:

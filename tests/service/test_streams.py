@@ -354,7 +354,9 @@ def test_sigterm_ends_streams_and_waits_promptly_and_cleanly(
         threads = [threading.Thread(target=each) for each in (listen, wait)]
         for thread in threads:
             thread.start()
-        until(lambda: "pliant_http_under_way 3" in http.get("/metrics").text)  # the stream, the wait and this request
+        until(
+            lambda: "pliant_http_requests_in_progress 3" in http.get("/metrics").text
+        )  # the stream, the wait and this request
         stopped = time.monotonic()
         service.send_signal(signal.SIGTERM)
         assert service.wait(20) == 0

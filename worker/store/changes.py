@@ -35,7 +35,7 @@ class RedisChanges(Changes):
             while not found and (left := until - time.monotonic()) > 0:
                 message = self._pubsub.get_message(timeout=left)
                 while message is not None:  # drain all messages that have arrived
-                    found.add(_text(message["data"]))
+                    found.add(message["data"])
                     message = self._pubsub.get_message(timeout=0)
         return found
 
@@ -64,7 +64,3 @@ class MemoryChanges(Changes):
 
     def close(self) -> None:
         """See `Changes.close`."""
-
-
-def _text(data: bytes | str) -> str:
-    return data.decode() if isinstance(data, bytes) else data

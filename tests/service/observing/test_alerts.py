@@ -129,9 +129,9 @@ def test_load_dependent_alerts_fire_on_synthetic_metrics(slow: str, depth: int, 
     prometheus = Prometheus()
     told = (
         'pliant_http_requests_total{{status="200"}} {ok}\npliant_http_requests_total{{status="503"}} {failed}\n'
-        'pliant_http_answer_seconds_bucket{{method="{slow}",route="/v1/jobs/{{id}}",le="1.0"}} {fast}\n'
-        'pliant_http_answer_seconds_bucket{{method="{slow}",route="/v1/jobs/{{id}}",le="2.5"}} {ok}\n'
-        'pliant_http_answer_seconds_bucket{{method="{slow}",route="/v1/jobs/{{id}}",le="+Inf"}} {ok}\n'
+        'pliant_http_request_duration_seconds_bucket{{method="{slow}",route="/v1/jobs/{{id}}",le="1.0"}} {fast}\n'
+        'pliant_http_request_duration_seconds_bucket{{method="{slow}",route="/v1/jobs/{{id}}",le="2.5"}} {ok}\n'
+        'pliant_http_request_duration_seconds_bucket{{method="{slow}",route="/v1/jobs/{{id}}",le="+Inf"}} {ok}\n'
         'pliant_webhooks_total{{result="given_up"}} {given_up}\npliant_store_up 1\n'
         "pliant_queue_oldest_seconds {age}\npliant_queue_depth {depth}\n"
     )

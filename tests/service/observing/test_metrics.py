@@ -74,8 +74,10 @@ def test_metrics_count_jobs_and_requests(serve: Serve) -> None:
     assert at(now, "pliant_http_requests_total", method="POST", route="/v1/jobs", status="202") == 3
     assert at(now, "pliant_http_requests_total", method="GET", route="/v1/jobs/{id}", status="404") == 1
     assert at(now, "pliant_http_requests_total", method="GET", route="other", status="404") == 1
-    assert at(now, "pliant_http_answer_seconds_count", method="GET", route="/v1/jobs/{id}") == 2, "without the wait"
-    assert at(now, "pliant_http_under_way") == 1, "this request itself"
+    assert at(now, "pliant_http_request_duration_seconds_count", method="GET", route="/v1/jobs/{id}") == 2, (
+        "without the wait"
+    )
+    assert at(now, "pliant_http_requests_in_progress") == 1, "this request itself"
     assert "nobody" not in answer.text, "addresses are strangers' text"
 
 
