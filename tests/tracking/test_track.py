@@ -149,7 +149,8 @@ def test_the_result_does_not_depend_on_threads(turning: tuple[Path, RenderedFilm
     for name in ("tracks", "visibility", "confidence", "faces"):
         np.testing.assert_array_equal(getattr(tracked, name), getattr(two, name))
     early = [
-        track_film(path, region=film.region(2), region_frame=2, grid_step=3, threads=threads) for threads in (1, 2)
+        track_film(path, region=film.region(2), region_frame=2, frames=":9", grid_step=3, threads=threads)
+        for threads in (1, 2)
     ]
     np.testing.assert_array_equal(early[0].tracks, early[1].tracks)
     assert cv2.getNumThreads() == before
@@ -189,7 +190,9 @@ def test_tracking_stops_at_every_stage(turning: tuple[Path, RenderedFilm], stage
             reached.set()
 
     with pytest.raises(TrackingStopped, match="stopped before it finished"):
-        track_film(path, region=film.region(0), template_frame=9, on_step=on_step, should_stop=reached.is_set)
+        track_film(
+            path, region=film.region(0), template_frame=9, grid_step=4, on_step=on_step, should_stop=reached.is_set
+        )
     assert [step.stage for step in steps].count(stage) == 1, "nothing more happens after the request"
 
 
@@ -202,7 +205,7 @@ def test_tracking_stops_between_its_two_passes(turning: tuple[Path, RenderedFilm
             last.set()
 
     with pytest.raises(TrackingStopped):
-        track_film(path, region=film.region(8), region_frame=8, on_step=on_step, should_stop=last.is_set)
+        track_film(path, region=film.region(8), region_frame=8, grid_step=4, on_step=on_step, should_stop=last.is_set)
 
 
 def test_without_a_region_the_whole_picture_is_tracked_with_a_warning(tmp_path: Path) -> None:
@@ -232,7 +235,7 @@ def test_only_the_templates_shot_is_tracked(tmp_path: Path) -> None:
     one, other = (films.textured_pictures(10, (96, 72), seed=seed) for seed in (0, 7))
     path = films.write_film(tmp_path / "film.mkv", one + other)
     polygon = [(20, 20), (70, 20), (70, 55), (20, 55)]
-    tracked = track_film(path, region=polygon, region_frame=14)
+    tracked = track_film(path, region=polygon, region_frame=14, grid_step=4)
     assert tracked.film.cuts == (10,)
     np.testing.assert_array_equal(tracked.film.frame_indices, np.arange(10, 20))
     expected = "The film has a cut (at frame 10). Only frames 10 to 19 are tracked. Film the object in one take."
@@ -244,7 +247,7 @@ def test_a_still_film_gets_a_warning(tmp_path: Path) -> None:
     random, (picture,) = np.random.default_rng(0), films.textured_pictures(1, (96, 72))
     noisy = [np.clip(picture + random.normal(0, 2, picture.shape), 0, 255).astype(np.uint8) for _ in range(12)]
     path = films.write_film(tmp_path / "film.mkv", noisy)
-    tracked = track_film(path, region=[(20, 20), (70, 20), (70, 55), (20, 55)])
+    tracked = track_film(path, region=[(20, 20), (70, 20), (70, 55), (20, 55)], grid_step=4)
     assert tracked.warnings == (
         "Nothing moves in this film, so it holds no information about depth. Turn the object by 30° or more to both sides, "
         "or walk around it.",
@@ -291,7 +294,7 @@ def test_parts_that_stay_hidden_are_counted_as_left_out(tmp_path: Path) -> None:
 
 def test_a_film_of_three_frames_is_tracked_and_one_of_two_refused(tmp_path: Path) -> None:
     pictures = films.textured_pictures(3, (96, 72))
-    tracked = track_film(films.write_film(tmp_path / "three.mkv", pictures))
+    tracked = track_film(films.write_film(tmp_path / "three.mkv", pictures), grid_step=4)
     assert tracked.tracks.shape[0] == 3
     assert "Only 3 frames are tracked. Film two seconds or more, while the object turns." in tracked.warnings
     with pytest.raises(FilmError, match="at least 3 frames, got 2") as caught:
@@ -481,7 +484,7 @@ def test_frames_of_a_carried_region_are_counted_to_the_last(turning: tuple[Path,
 
 def test_a_portrait_film_is_tracked_upright(tmp_path: Path) -> None:
     path = films.turned_by_90(films.write_film(tmp_path / "film.mp4", films.textured_pictures(6, (96, 72))))
-    tracked = track_film(path, region=[(18, 20), (54, 20), (54, 76), (18, 76)])
+    tracked = track_film(path, region=[(18, 20), (54, 20), (54, 76), (18, 76)], grid_step=4)
     assert (tracked.image_size, tracked.template_image.shape) == ((72, 96), (96, 72, 3))
     assert tracked.warnings == ("Only 6 frames are tracked. Film two seconds or more, while the object turns.",)
     step = np.diff(tracked.tracks, axis=0)[tracked.visibility[1:] & tracked.visibility[:-1]]
