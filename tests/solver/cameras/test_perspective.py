@@ -195,7 +195,6 @@ def test_focal_length_sign_of_depth_and_shapes_are_found(close: Solution) -> Non
     assert any(each.mirrored for each in candidates)
 
 
-@pytest.mark.slow  # shares its solve with the test above
 def test_the_cameras_project_to_the_pixels_given(close: Solution) -> None:
     tracks = pinhole(SEEN, FOCAL)
     left = np.linalg.norm(tracks.points - close.camera.project(close.shapes), axis=2)
