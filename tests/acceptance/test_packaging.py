@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import subprocess
 import sys
@@ -32,7 +33,8 @@ def run(*command: str, cwd: Path) -> str:
 def archives(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Return the source archive and the wheel that was built from it."""
     folder = tmp_path_factory.mktemp("dist")
-    run(sys.executable, "-m", "build", "--outdir", str(folder), str(ROOT), cwd=folder)
+    installer = "uv" if importlib.util.find_spec("uv") else "pip"  # the first is faster
+    run(sys.executable, "-m", "build", "--installer", installer, "--outdir", str(folder), str(ROOT), cwd=folder)
     (source,) = folder.glob("*.tar.gz")
     (wheel,) = folder.glob("*.whl")
     return source, wheel

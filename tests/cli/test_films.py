@@ -17,6 +17,7 @@ from pliant.client.errors import BadArgument
 from pliant.service.testing import InMemoryService
 from typer.testing import CliRunner, Result
 
+forked = pytest.mark.usefixtures("forked_readers")
 QUICK = ["-O", "outputs=[]", "-O", "max_reweightings=2", "-O", "grid_step=6", "-O", "refine_rotations=false"]
 QUICK += ["-O", "prior=smooth", "-O", "surface=free", "-O", "camera=orthographic"]
 
@@ -53,6 +54,7 @@ def test_a_film_is_solved_and_its_tracks_are_written_beside_the_shapes(film: Pat
     assert "also contains" not in words
 
 
+@forked
 def test_warnings_of_a_film_are_printed_once_before_its_points_are_followed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -65,6 +67,7 @@ def test_warnings_of_a_film_are_printed_once_before_its_points_are_followed(
     assert words.index(cut) < words.index("cameras")
 
 
+@forked
 def test_invalid_films_and_parts_are_rejected_with_a_message(film: Path, tmp_path: Path) -> None:
     ran = solve(film, "--mesh", "3x4", "-o", tmp_path)
     assert ran.exit_code == Exit.REFUSED
@@ -79,6 +82,7 @@ def test_invalid_films_and_parts_are_rejected_with_a_message(film: Path, tmp_pat
 
 
 @pytest.mark.slow
+@forked
 def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
     def inspect(*arguments: object) -> Result:
         return CliRunner().invoke(app, ["inspect", *map(str, arguments)], env={"COLUMNS": "200"})
@@ -129,6 +133,7 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
         assert f"options.{name}: expected a frame number from 0 to 9, got 1000." in refused.output
 
 
+@forked
 def test_a_folder_of_two_pictures_and_tracks_is_described_as_it_was_read(tmp_path: Path) -> None:
     for number in range(2):
         (tmp_path / f"{number}.png").write_bytes(films.png(np.zeros((48, 64, 3), np.uint8)))
@@ -147,6 +152,7 @@ def copied(film: Path, folder: Path) -> Path:
     return copy
 
 
+@forked
 def test_a_film_without_a_region_gets_its_warning_before_it_is_tracked(
     film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -161,6 +167,7 @@ def test_a_film_without_a_region_gets_its_warning_before_it_is_tracked(
 
 
 @pytest.mark.slow
+@forked
 def test_folders_of_pictures_are_sent_as_zips(tmp_path: Path) -> None:
     pictures = [films.png(each) for each in films.textured_pictures(4, (96, 72))]
     for folder in (tmp_path / "first", tmp_path / "second"):

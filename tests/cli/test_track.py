@@ -22,6 +22,12 @@ from pliant.tracking.records import TrackingStep
 from typer.testing import CliRunner, Result
 
 
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    """A film for tests that do not look at its tracks."""
+    return films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (48, 36)))
+
+
 def test_a_film_becomes_tracks_and_a_preview(tmp_path: Path) -> None:
     film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(10, (96, 72)))
     mask = np.zeros((72, 96), np.uint8)
@@ -42,11 +48,10 @@ def test_a_film_becomes_tracks_and_a_preview(tmp_path: Path) -> None:
     assert "sheet" not in ran.stdout
 
 
-def test_the_preview_is_named_in_the_output(tmp_path: Path) -> None:
-    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72)))
+def test_the_preview_is_named_in_the_output(small: Path, tmp_path: Path) -> None:
     files = [
         "track",
-        str(film),
+        str(small),
         "-o",
         str(tmp_path / "tracks.npz"),
         "--preview",
@@ -59,11 +64,10 @@ def test_the_preview_is_named_in_the_output(tmp_path: Path) -> None:
 
 
 def test_warnings_are_printed_once_and_before_the_work_they_are_about(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The tracker's survey stops here, so that only what was known before the film was read has been printed."""
-    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72)))
-    files = ["track", str(film), "-o", str(tmp_path / "tracks.npz")]
+    files = ["track", str(small), "-o", str(tmp_path / "tracks.npz")]
     ran = CliRunner().invoke(app, files)
     sentences = ["No region was given, so everything in the picture is tracked", "Only 4 frames are tracked."]
     for sentence in sentences:
@@ -101,16 +105,15 @@ def test_a_file_of_tracks_is_no_film(tmp_path: Path) -> None:
     assert "command line: pliant solve tracks.npz" in document["hint"]
 
 
-def test_a_file_of_the_command_is_not_replaced_by_another(tmp_path: Path) -> None:
-    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72)))
-    before = film.read_bytes()
+def test_a_file_of_the_command_is_not_replaced_by_another(small: Path, tmp_path: Path) -> None:
+    before = small.read_bytes()
     for given in (["-o", "tracks.npz", "--preview", "tracks.npz"], ["-o", "film.mkv", "--force"]):
         files = [name if name.startswith("-") else str(tmp_path / name) for name in given]
-        ran = CliRunner().invoke(app, ["track", str(film), *files])
+        ran = CliRunner().invoke(app, ["track", str(small), *files])
         assert ran.exit_code == 3, ran.output
         assert "is also another file of this command" in " ".join(ran.output.split())
     assert [each.name for each in tmp_path.iterdir()] == ["film.mkv"]
-    assert film.read_bytes() == before
+    assert small.read_bytes() == before
 
 
 def track(*arguments: object) -> Result:
@@ -147,14 +150,14 @@ def test_a_file_may_have_the_longest_name(tmp_path: Path) -> None:
         aside.write_text("content")
         assert aside.parent == tmp_path
     assert [each.name for each in tmp_path.iterdir()] == ["x" * 251 + ".npz"]
-    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72)))
+    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (48, 36)))
     assert track(film, "-o", tmp_path / "A.NPZ", "--preview", tmp_path / "a.JPEG").exit_code == 0
 
 
 def test_a_preview_is_no_frame_of_the_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "film"
     folder.mkdir()
-    for number, picture in enumerate(films.textured_pictures(4, (96, 72))):
+    for number, picture in enumerate(films.textured_pictures(4, (48, 36))):
         (folder / f"{number}.png").write_bytes(films.png(picture))
     with monkeypatch.context() as patch:
         not_tracked(patch)
@@ -166,6 +169,7 @@ def test_a_preview_is_no_frame_of_the_film(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+@pytest.mark.usefixtures("forked_readers")
 def test_a_name_that_is_no_utf_8_is_refused(tmp_path: Path) -> None:
     film = Path(os.fsdecode(bytes(tmp_path) + b"/bad\xff.mkv"))
     films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72))).rename(film)
@@ -175,8 +179,7 @@ def test_a_name_that_is_no_utf_8_is_refused(tmp_path: Path) -> None:
         assert "bad?.mkv. Rename the file or folder." in " ".join(ran.output.split())
 
 
-def test_earlier_tracks_survive_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72)))
+def test_earlier_tracks_survive_a_full_disk(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "tracks.npz").write_bytes(b"earlier")
 
     def full(stream: IO[bytes], **arrays: object) -> None:
@@ -184,15 +187,14 @@ def test_earlier_tracks_survive_a_full_disk(tmp_path: Path, monkeypatch: pytest.
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(np, "savez_compressed", full)
-    ran = CliRunner().invoke(app, ["track", str(film), "-o", str(tmp_path / "tracks.npz"), "--force"])
+    ran = CliRunner().invoke(app, ["track", str(small), "-o", str(tmp_path / "tracks.npz"), "--force"])
     assert ran.exit_code == 3, ran.output
     assert (tmp_path / "tracks.npz").read_bytes() == b"earlier"
     assert {each.name for each in tmp_path.iterdir()} == {"film.mkv", "tracks.npz"}
 
 
-def test_names_with_brackets_are_printed_in_full(tmp_path: Path) -> None:
-    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (96, 72)))
-    ran = CliRunner().invoke(app, ["track", str(film), "-o", str(tmp_path / "tracks[final].npz")])
+def test_names_with_brackets_are_printed_in_full(small: Path, tmp_path: Path) -> None:
+    ran = CliRunner().invoke(app, ["track", str(small), "-o", str(tmp_path / "tracks[final].npz")])
     assert "tracks[final].npz: " in ran.stdout
 
 

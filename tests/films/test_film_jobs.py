@@ -55,6 +55,7 @@ from pliant.worker.processes.no_network import forbid_network
 from pliant.worker.settings import Settings
 
 SIZE = (96, 72)
+forked = pytest.mark.usefixtures("forked_readers")
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +79,7 @@ def refusal(source: FilmSource, options: Options = Options(), bounds: FilmBounds
     return refused.value
 
 
+@forked
 def test_a_film_is_checked_without_being_tracked(film: Path, region: Path) -> None:
     facts = read_film(FilmSource(film, region), Options(frames="2:10:2")).facts
     assert (facts.container, facts.width, facts.height, facts.fps) == ("matroska", *SIZE, 15.0)
@@ -89,6 +91,7 @@ def test_a_film_is_checked_without_being_tracked(film: Path, region: Path) -> No
     assert "96×72 pixels" in stated.notes[0]
 
 
+@forked
 def test_a_film_has_its_own_size_and_no_use_for_options_of_tracks(film: Path) -> None:
     facts = read_film(FilmSource(film), Options()).facts
     assert film_options(Options(image_size="96x72"), facts).image_size == "96x72"
@@ -100,6 +103,7 @@ def test_a_film_has_its_own_size_and_no_use_for_options_of_tracks(film: Path) ->
     assert notes[1:] == ["Not used for films: layout, y_axis."]
 
 
+@forked
 def test_the_rate_of_pictures_is_said_to_be_assumed(tmp_path: Path) -> None:
     textured = films.textured_pictures(3, SIZE)
     pictures = films.zip_of(
@@ -113,6 +117,7 @@ def test_the_rate_of_pictures_is_said_to_be_assumed(tmp_path: Path) -> None:
     assert sentence not in described(read_film(FilmSource(film), Options()).facts, Options()).notes
 
 
+@forked
 def test_the_first_frame_of_the_whole_film_is_returned_on_request(film: Path, tmp_path: Path) -> None:
     assert read_film(FilmSource(film), Options()).facts.first_frame == ""
     for frames in ("", "4:10"):
@@ -130,12 +135,14 @@ def test_the_first_frame_of_the_whole_film_is_returned_on_request(film: Path, tm
     assert (facts.width, facts.height) == (1200, 900)
 
 
+@forked
 def test_an_incompressible_first_frame_fits_the_answer(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (900, 900, 3), dtype=np.uint8)
     pictures = films.zip_of(tmp_path / "noise.zip", {f"{number}.png": films.png(noise) for number in range(3)})
     assert len(read_film(FilmSource(pictures), Options(), picture=True).facts.first_frame) < MAX_ANSWER / 1.5
 
 
+@forked
 def test_film_limits_come_from_the_settings(film: Path) -> None:
     settings = Settings(film_frames=8, film_pixels=5000, film_seconds=2)
     bounds = FilmBounds.of(settings, max_bytes=10**6)
@@ -147,6 +154,7 @@ def test_film_limits_come_from_the_settings(film: Path) -> None:
     assert refusal(FilmSource(film), bounds=bounds).code == "too_many_pixels"
 
 
+@forked
 def test_a_portrait_film_is_upright(tmp_path: Path) -> None:
     path = films.turned_by_90(films.write_film(tmp_path / "film.mp4", films.textured_pictures(6, SIZE)))
     facts = read_film(FilmSource(path), Options()).facts
@@ -154,6 +162,7 @@ def test_a_portrait_film_is_upright(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@forked
 def test_options_that_do_not_fit_the_film_are_rejected(film: Path, region: Path, tmp_path: Path) -> None:
     Image.new("L", (10, 10), 255).save(tmp_path / "small.png")
     wrong = refusal(FilmSource(film, tmp_path / "small.png"))
@@ -196,6 +205,7 @@ def test_a_film_of_many_cuts_has_a_short_warning(film: Path) -> None:
     assert Tracked(container="matroska", fps=30.0, warnings=warnings).warnings == warnings
 
 
+@forked
 def test_a_cut_is_reported_before_the_points_are_followed(tmp_path: Path) -> None:
     one, other = (films.textured_pictures(10, (96, 72), seed=seed) for seed in (0, 7))
     cut = films.write_film(tmp_path / "cut.mkv", one + other)
@@ -240,6 +250,7 @@ def test_each_exit_of_the_film_process_maps_to_an_error() -> None:
             tracker._answer(FilmFacts, answer, FilmBounds(), 1.0)
 
 
+@forked
 def test_a_film_and_its_region_are_stored_byte_for_byte(film: Path, region: Path, tmp_path: Path) -> None:
     source = FilmSource(film, region)
     facts = read_film(source, Options()).facts
@@ -331,6 +342,7 @@ def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Pa
     check_film_frames(tmp_path / "out", count=10)
 
 
+@forked
 def test_a_film_with_too_many_points_for_the_memory_is_refused_before_it_is_solved(
     film: Path, region: Path, tmp_path: Path
 ) -> None:
@@ -347,6 +359,7 @@ def test_a_film_with_too_many_points_for_the_memory_is_refused_before_it_is_solv
     assert not (tmp_path / "out").exists()
 
 
+@forked
 def test_the_time_estimate_uses_the_measured_machine_pace(
     film: Path, region: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

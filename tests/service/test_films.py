@@ -103,6 +103,7 @@ def test_a_finished_job_has_the_rate_of_the_tracked_frames(
 
 
 @pytest.mark.slow
+@forked
 def test_a_film_without_a_region_succeeds_with_a_warning(running: Running, http: httpx.Client, film: bytes) -> None:
     done = work(running, send(http, film, options=QUICK).id)
     assert done.status is Status.SUCCEEDED, done.error
@@ -241,6 +242,7 @@ def test_cancelling_stops_the_tracking(running: Running, http: httpx.Client, tmp
     assert done.artifacts == []
 
 
+@forked
 def test_a_rerun_of_a_film_keeps_its_tracking_options(running: Running, http: httpx.Client, film: bytes) -> None:
     corners = [[20, 20], [70, 20], [70, 55]]
     given = {"region_polygon": corners, "frames": "0:8", "template_frame": 0, "max_points": 30}
@@ -256,6 +258,7 @@ def test_a_rerun_of_a_film_keeps_its_tracking_options(running: Running, http: ht
     assert Job.model_validate_json(http.post("/v1/jobs", files=parts).content).options.region_polygon is None
 
 
+@forked
 def test_a_polygon_replaces_the_region_of_a_film_that_is_solved_again(
     running: Running, http: httpx.Client, film: bytes
 ) -> None:
@@ -268,6 +271,7 @@ def test_a_polygon_replaces_the_region_of_a_film_that_is_solved_again(
     assert work(running, again.id).status is Status.SUCCEEDED
 
 
+@forked
 def test_more_frames_than_the_film_has_cannot_be_required_of_a_point(
     running: Running, http: httpx.Client, film: bytes
 ) -> None:

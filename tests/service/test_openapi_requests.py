@@ -50,6 +50,8 @@ def _document() -> dict[str, Any]:
 
 DOCUMENT = _document()
 OPERATIONS = [(method.upper(), path) for path, methods in DOCUMENT["paths"].items() for method in methods]
+SLOW = {("POST", "/v1/jobs"), ("PUT", "/v1/jobs/{id}")}
+"""Operations whose forms take seconds to generate."""
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +78,11 @@ def token(guarded: Running) -> str:
 
 
 @pytest.mark.parametrize("mode", [GenerationMode.POSITIVE, GenerationMode.NEGATIVE], ids=["fits", "does not fit"])
-@pytest.mark.parametrize(("method", "path"), OPERATIONS, ids=lambda part: str(part))
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [pytest.param(*each, marks=pytest.mark.slow if each in SLOW else ()) for each in OPERATIONS],
+    ids=lambda part: str(part),
+)
 def test_every_response_is_declared(
     guarded: Running, schema: Any, counts: Counter[str], token: str, method: str, path: str, mode: GenerationMode
 ) -> None:

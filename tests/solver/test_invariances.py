@@ -212,7 +212,7 @@ def test_flipping_the_y_axis_mirrors_the_shapes() -> None:
     assert_same(up.shapes * [1, -1, 1], down.shapes)
 
 
-NOISY = scene(16, 300, outliers=0.0, hidden=0.0)
+NOISY = scene(12, 200, outliers=0.0, hidden=0.0)
 TRANSFORMED = {
     "askew": rolled(NOISY, 33),
     "moved": moved(NOISY),

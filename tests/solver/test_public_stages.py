@@ -232,7 +232,7 @@ def test_mismatched_inputs_are_rejected(cameras: Cameras, prior: Prior, solution
         solve_shapes(tracks, cameras, prior, settings=Settings(prior="smooth"))
 
 
-@pytest.mark.parametrize("prior", ["gaussian", "smooth"])
+@pytest.mark.parametrize("prior", [pytest.param("gaussian", marks=pytest.mark.slow), "smooth"])
 def test_the_unit_of_given_scales_is_that_of_the_shapes_only(prior: str) -> None:
     # Rounding differs between the units, so at the usual tolerance the two solves may end one reweighting apart.
     settings = Settings(prior=prior, tolerance=1e-7, max_reweightings=300)  # type: ignore[arg-type]

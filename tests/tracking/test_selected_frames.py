@@ -73,7 +73,10 @@ def test_a_region_moves_as_a_whole_with_its_visible_points() -> None:
 def test_without_a_region_only_selected_frames_are_read(film: Path) -> None:
     read: list[int] = []
     tracked = track_film(
-        film, frames="8:14", on_step=lambda step: read.append(step.done) if step.stage == "read" else None
+        film,
+        frames="8:14",
+        grid_step=6,
+        on_step=lambda step: read.append(step.done) if step.stage == "read" else None,
     )
     assert max(read) == len(tracked.tracks) == 6
 
@@ -90,7 +93,7 @@ def test_a_region_far_from_the_selected_frames_is_refused(film: Path) -> None:
     with pytest.raises(FilmError) as caught:
         track_film(film, region=REGION, frames="8:", limits=FilmLimits(frames=7))
     assert (caught.value.code, caught.value.field) == ("too_many_frames", "region_frame")
-    assert len(track_film(film, region=REGION, frames="8:", limits=FilmLimits(frames=8)).tracks) == 8
+    assert len(track_film(film, region=REGION, frames="8:", grid_step=3, limits=FilmLimits(frames=8)).tracks) == 8
     with pytest.raises(FilmError, match="expected at least 3 frames, got 2"):
         track_film(film, region=REGION, frames="14:")
 
@@ -100,7 +103,8 @@ def test_a_region_drawn_before_a_cut_is_not_used_after_it(two_shots: Path) -> No
         track_film(two_shots, region=REGION, frames="12:")
     assert (caught.value.code, caught.value.field) == ("region_lost", "region_frame")
     assert "drawn in frames 0 to 9, before or after a cut" in str(caught.value)
-    assert track_film(two_shots, region=REGION, region_frame=11, frames="12:").film.frame_indices[0] == 12
+    tracked = track_film(two_shots, region=REGION, region_frame=11, frames="12:", grid_step=3)
+    assert tracked.film.frame_indices[0] == 12
 
 
 def test_a_template_in_another_shot_than_the_region_is_refused(two_shots: Path) -> None:
@@ -131,7 +135,7 @@ def test_a_template_that_is_not_selected_is_refused_before_the_film_is_read(
 
 def test_a_skipped_frame_beside_the_selected_ones_stands_for_the_nearest(film: Path) -> None:
     for template, row in ((7, 0), (13, 2)):
-        assert track_film(film, frames="8:13:2", template_frame=template).template == row
+        assert track_film(film, frames="8:13:2", template_frame=template, grid_step=6).template == row
 
 
 def test_frames_of_a_region_beyond_the_film_are_refused_before_it_is_read(film: Path) -> None:
@@ -161,4 +165,4 @@ def test_numpy_integers_are_frame_numbers(film: Path) -> None:
     opened = open_film(film, frames=slice(np.int64(2), np.int64(8), np.int32(2)))
     assert opened.selection == (2, 8, 2)
     assert open_film(film, frames=np.int64(8)).selection == (0, None, 2)  # type: ignore[arg-type]
-    assert track_film(opened, template_frame=np.int64(4)).template == 1  # type: ignore[arg-type]
+    assert track_film(opened, template_frame=np.int64(4), grid_step=6).template == 1  # type: ignore[arg-type]

@@ -149,7 +149,8 @@ def test_the_result_does_not_depend_on_threads(turning: tuple[Path, RenderedFilm
     for name in ("tracks", "visibility", "confidence", "faces"):
         np.testing.assert_array_equal(getattr(tracked, name), getattr(two, name))
     early = [
-        track_film(path, region=film.region(2), region_frame=2, grid_step=3, threads=threads) for threads in (1, 2)
+        track_film(path, region=film.region(2), region_frame=2, frames=":9", grid_step=3, threads=threads)
+        for threads in (1, 2)
     ]
     np.testing.assert_array_equal(early[0].tracks, early[1].tracks)
     assert cv2.getNumThreads() == before
@@ -189,7 +190,9 @@ def test_tracking_stops_at_every_stage(turning: tuple[Path, RenderedFilm], stage
             reached.set()
 
     with pytest.raises(TrackingStopped, match="stopped before it finished"):
-        track_film(path, region=film.region(0), template_frame=9, on_step=on_step, should_stop=reached.is_set)
+        track_film(
+            path, region=film.region(0), template_frame=9, grid_step=4, on_step=on_step, should_stop=reached.is_set
+        )
     assert [step.stage for step in steps].count(stage) == 1, "nothing more happens after the request"
 
 
@@ -202,7 +205,7 @@ def test_tracking_stops_between_its_two_passes(turning: tuple[Path, RenderedFilm
             last.set()
 
     with pytest.raises(TrackingStopped):
-        track_film(path, region=film.region(8), region_frame=8, on_step=on_step, should_stop=last.is_set)
+        track_film(path, region=film.region(8), region_frame=8, grid_step=4, on_step=on_step, should_stop=last.is_set)
 
 
 def test_without_a_region_the_whole_picture_is_tracked_with_a_warning(tmp_path: Path) -> None:
@@ -238,7 +241,7 @@ def test_only_the_templates_shot_is_tracked(tmp_path: Path) -> None:
     one, other = (films.textured_pictures(10, (96, 72), seed=seed) for seed in (0, 7))
     path = films.write_film(tmp_path / "film.mkv", one + other)
     polygon = [(20, 20), (70, 20), (70, 55), (20, 55)]
-    tracked = track_film(path, region=polygon, region_frame=14)
+    tracked = track_film(path, region=polygon, region_frame=14, grid_step=4)
     assert tracked.film.cuts == (10,)
     np.testing.assert_array_equal(tracked.film.frame_indices, np.arange(10, 20))
     expected = "The film has a cut (at frame 10). Only frames 10 to 19 are tracked. Film the object in one take."
@@ -250,7 +253,7 @@ def test_a_still_film_gets_a_warning(tmp_path: Path) -> None:
     random, (picture,) = np.random.default_rng(0), films.textured_pictures(1, (96, 72))
     noisy = [np.clip(picture + random.normal(0, 2, picture.shape), 0, 255).astype(np.uint8) for _ in range(12)]
     path = films.write_film(tmp_path / "film.mkv", noisy)
-    tracked = track_film(path, region=[(20, 20), (70, 20), (70, 55), (20, 55)])
+    tracked = track_film(path, region=[(20, 20), (70, 20), (70, 55), (20, 55)], grid_step=4)
     assert tracked.warnings == (
         "Nothing moves in this film, so it holds no information about depth. Turn the object by 30° or more to both sides, "
         "or walk around it.",
@@ -297,7 +300,7 @@ def test_parts_that_stay_hidden_are_counted_as_left_out(tmp_path: Path) -> None:
 
 def test_a_film_of_three_frames_is_tracked_and_one_of_two_refused(tmp_path: Path) -> None:
     pictures = films.textured_pictures(3, (96, 72))
-    tracked = track_film(films.write_film(tmp_path / "three.mkv", pictures))
+    tracked = track_film(films.write_film(tmp_path / "three.mkv", pictures), grid_step=4)
     assert tracked.tracks.shape[0] == 3
     assert "Only 3 frames are tracked. Film two seconds or more, while the object turns." in tracked.warnings
     with pytest.raises(FilmError, match="at least 3 frames, got 2") as caught:
@@ -337,20 +340,21 @@ def test_unrelated_frames_are_rejected(tmp_path: Path) -> None:
 
 
 def test_the_template_is_the_region_s_frame_or_one_in_the_middle(tmp_path: Path) -> None:
-    pictures = [picture.copy() for picture in films.textured_pictures(15, (96, 72))]
+    pictures = [picture.copy() for picture in films.textured_pictures(9, (96, 72))]
     path, region = films.write_film(tmp_path / "film.mkv", pictures), [(10, 20), (40, 20), (40, 55), (10, 55)]
-    for drawn in (5, 9):
-        assert track_film(path, region=region, region_frame=drawn).template == drawn, "in the middle third"
-    for drawn in (0, 4, 10, 14):
-        tracked = track_film(path, region=region, region_frame=drawn)
-        assert tracked.template in middle_of(0, 15)
+    for drawn in (3, 5):
+        tracked = track_film(path, region=region, region_frame=drawn, grid_step=4)
+        assert tracked.template == drawn, "in the middle third"
+    for drawn in (0, 2, 6, 8):
+        tracked = track_film(path, region=region, region_frame=drawn, grid_step=4)
+        assert tracked.template in middle_of(0, 9)
         moved = tracked.template - drawn
         across = tracked.tracks[tracked.template][:, 0]
         assert (across.min(), across.max()) == pytest.approx((10 + moved, 40 + moved), abs=5)
     for number, picture in enumerate(pictures):
-        picture[max(14, 72 - 9 * number) :] = 120  # a blank panel rises and covers the region
+        picture[max(14, 72 - 15 * number) :] = 120  # a blank panel rises and covers the region
     path = films.write_film(tmp_path / "film.mkv", pictures)
-    assert track_film(path, region=region).template == 0, "the region is lost in the middle"
+    assert track_film(path, region=region, grid_step=4).template == 0, "the region is lost in the middle"
 
 
 def test_a_region_lost_before_the_template_is_rejected(tmp_path: Path) -> None:
@@ -486,7 +490,7 @@ def test_frames_of_a_carried_region_are_counted_to_the_last(turning: tuple[Path,
 
 def test_a_portrait_film_is_tracked_upright(tmp_path: Path) -> None:
     path = films.turned_by_90(films.write_film(tmp_path / "film.mp4", films.textured_pictures(6, (96, 72))))
-    tracked = track_film(path, region=[(18, 20), (54, 20), (54, 76), (18, 76)])
+    tracked = track_film(path, region=[(18, 20), (54, 20), (54, 76), (18, 76)], grid_step=4)
     assert (tracked.image_size, tracked.template_image.shape) == ((72, 96), (96, 72, 3))
     assert tracked.warnings == ("Only 6 frames are tracked. Film two seconds or more, while the object turns.",)
     step = np.diff(tracked.tracks, axis=0)[tracked.visibility[1:] & tracked.visibility[:-1]]

@@ -154,8 +154,8 @@ def test_the_focal_length_of_given_cameras_with_a_moving_object() -> None:
 
 @pytest.mark.slow
 def test_focal_length_and_shapes_of_an_object_that_moves_through_the_picture() -> None:
-    face = gallery.face(30, 120, degrees=40)
-    seen, tracks = moving_face(face, np.linspace(-75, 225, 30), noise=0.1)
+    face = gallery.face(15, 60, degrees=40)
+    seen, tracks = moving_face(face, np.linspace(-75, 225, 15), noise=0.1)
     solution = solve(tracks, face.mesh, settings=Settings(image_size=PICTURE, surface="free"))
     assert focal_error(solution.camera, 900) < 0.1
     assert e3d_frame_scaled(solution.shapes, seen) < 0.03

@@ -41,7 +41,7 @@ def body(frames: int = 24, points: int = 300, turn: float = 50.0) -> tuple[Float
 
 @pytest.mark.slow
 def test_the_focal_length_does_not_depend_on_the_points_that_the_body_hides() -> None:
-    images, placed, visible = body()
+    images, placed, visible = body(points=150)
     kept = visible.sum(axis=0) >= 3
     assert 0.2 < 1 - visible[:, kept].mean() < 0.4
     images = images + np.random.default_rng(1).normal(scale=0.1, size=images.shape)

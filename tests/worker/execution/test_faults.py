@@ -10,12 +10,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pliant.schemas.job import Status
 from pliant.solver.gallery import face
+from pliant.worker.errors import NotAllowedNow
 from pliant.worker.execution.pipeline import reconstruct
 from pliant.worker.formats import load_inputs
 from pliant.worker.jobs.retry import retry
@@ -40,6 +42,21 @@ def house(
     )  # fmt: skip
     with House(settings, inputs=inputs_files) as house:
         yield house
+
+
+@pytest.fixture(autouse=True)
+def left_running(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Cancel the jobs that a failed test leaves, which would occupy both workers during the next tests."""
+    yield
+    if "house" in request.fixturenames:
+        house: House = request.getfixturevalue("house")
+        left = [job.id for job in house.jobs.page(limit=200).jobs if not job.status.final]
+        if left:
+            house.thaw()
+        for id in left:
+            with suppress(NotAllowedNow):  # it has ended meanwhile
+                house.jobs.cancel(id)
+            house.final(id)
 
 
 def test_a_queued_job_gives_the_same_bits_as_a_direct_call(house: House, tmp_path: Path) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 import struct
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -15,8 +17,10 @@ from pliant.schemas.outputs import OutputRequest
 from pliant.worker.errors import Conflict, NotAllowedNow, QuotaExceeded, TooManyQueued, UnknownJob
 from pliant.worker.execution.attempt import Attempt, work
 from pliant.worker.execution.further_outputs import read_solution, write_further
-from pliant.worker.formats import InvalidInput, save_inputs
+from pliant.worker.execution.pipeline import reconstruct
+from pliant.worker.formats import InvalidInput, load_inputs, save_inputs
 from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.finished import Finished
 from pliant.worker.jobs.further_outputs import make_outputs
 from pliant.worker.jobs.retry import retry
 from pliant.worker.jobs.service import Jobs
@@ -28,23 +32,39 @@ WANTED = OutputRequest(outputs=("obj",), axes="viewer")
 OPTIONS = Options(method="pseudo_inverse", outputs=("ply",), refine_rotations=False)
 
 
-def run(jobs: Jobs, job: Job, folder: Path) -> Job:
-    """Work on a queued job as a worker would."""
+def run(jobs: Jobs, job: Job, folder: Path, *, reconstruct: Callable[..., Finished] | None = None) -> Job:
+    """Work on a queued job as a worker would; `reconstruct` replaces the solve."""
     attempt_id = jobs.records.get(job.id).attempt_id
     now = datetime.now(UTC)
     stored = jobs.records.update(job.id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker="w", now=now))
     jobs.queue.remove(attempt_id)
     folder.mkdir(parents=True)
     attempt = Attempt(jobs=jobs, id=job.id, attempt_id=attempt_id, deadline=float("inf"))
-    attempt.conclude(work(attempt, stored, folder))
+    attempt.conclude(work(attempt, stored, folder, reconstruct=reconstruct))
     return jobs.get(job.id)
 
 
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Finished]:
+    """A folder with the inputs and the result files of one solve, and its outcome."""
+    folder = tmp_path_factory.mktemp("kept")
+    make_inputs(folder / "in.npz", frames=4, points=30)
+    return folder, reconstruct(load_inputs(folder / "in.npz"), OPTIONS, folder / "artifacts", name="face")
+
+
 @pytest.fixture
-def solved(jobs: Jobs, tmp_path: Path) -> Job:
-    read = make_inputs(tmp_path / "in.npz", frames=4, points=30).interpretation
+def solved(jobs: Jobs, kept: tuple[Path, Finished], tmp_path: Path) -> Job:
+    """A job with that result."""
+    folder, finished = kept
+
+    def copy(inputs: object, options: object, results: Path, **_: object) -> Finished:
+        shutil.copytree(folder / "artifacts", results)
+        return finished
+
+    shutil.copy(folder / "in.npz", tmp_path / "in.npz")
+    read = load_inputs(folder / "in.npz").interpretation
     job = jobs.submit(tmp_path / "in.npz", Submission(options=OPTIONS, name="face"), interpretation=read)
-    done = run(jobs, job, tmp_path / "solving")
+    done = run(jobs, job, tmp_path / "solving", reconstruct=copy)
     assert done.status is Status.SUCCEEDED, done.error
     return done
 
