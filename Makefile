@@ -10,13 +10,12 @@ GENERATOR := $(VENV)/generator
 PAGE := service/web/dist/index.html
 PAGE_SOURCES := $(wildcard service/web/*.json service/web/*.mjs service/web/src/* service/web/src/*/*)
 
-.PHONY: help demo test test-slow test-all test-long matrix coverage page client docs lint types check format clean
+.PHONY: help demo test test-slow test-long matrix coverage page client docs lint types check format clean
 
 help:
 	@echo "make demo    reconstruct a moving face end to end: service, queue, worker, glTF"
 	@echo "make test    run the tests: about four minutes on two cores, nothing but Python needed"
 	@echo "make test-slow  run what is slow or needs Chromium, Node.js, an S3 server or root"
-	@echo "make test-all  make test and make test-slow in one run, which takes less time than both"
 	@echo "make test-long  run long forms of what the other tests cover"
 	@echo "make matrix  make test with every Python from 3.11 to 3.14 on this machine"
 	@echo "make coverage   make test, with the share of lines that it runs"
@@ -95,10 +94,6 @@ test: $(STAMP)
 
 test-slow: $(STAMP) $(PAGE)
 	$(call RUN_TESTS,($(NEEDY)) and not long)
-
-# One run loads the tests once, and the waiting of services and pages is filled with all computations.
-test-all: $(STAMP) $(PAGE)
-	$(call RUN_TESTS,not long)
 
 # Long forms of what other tests cover in less time.
 test-long: $(STAMP) $(PAGE)
