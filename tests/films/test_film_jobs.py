@@ -51,7 +51,7 @@ from pliant.worker.films.tracker import (
 from pliant.worker.formats import Inputs
 from pliant.worker.formats.cost import LIBRARIES, estimated
 from pliant.worker.processes.contained import MAX_ANSWER, MAX_LINE, Ended, _Progress
-from pliant.worker.processes.no_network import forbid_network
+from pliant.worker.processes.no_network import restrict_process
 from pliant.worker.settings import Settings
 
 SIZE = (96, 72)
@@ -471,8 +471,8 @@ def test_tracker_confidence_becomes_the_observation_weight(tmp_path: Path) -> No
 def test_the_film_process_has_no_network_and_starts_no_programs() -> None:
     script = textwrap.dedent("""
         import socket, subprocess, threading
-        from pliant.worker.processes.no_network import forbid_network
-        print(forbid_network())
+        from pliant.worker.processes.no_network import restrict_process
+        print(restrict_process())
         for attempt in (socket.socket, lambda: subprocess.run(["/bin/true"])):
             try:
                 attempt()
@@ -489,7 +489,7 @@ def test_the_film_process_has_no_network_and_starts_no_programs() -> None:
 
 def test_an_unknown_architecture_has_no_network_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("platform.machine", lambda: "pdp11")
-    assert not forbid_network()
+    assert not restrict_process()
 
 
 def test_progress_is_passed_on_and_invalid_lines_dropped() -> None:

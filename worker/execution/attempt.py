@@ -25,7 +25,7 @@ from pliant.schemas.job import Problem, Progress, Status
 from pliant.worker import tracing
 from pliant.worker.errors import Interrupted, StaleAttempt, StoreUnavailable, UnknownJob
 from pliant.worker.execution.failures import problem_of, timed_out
-from pliant.worker.execution.monitor import Patience
+from pliant.worker.execution.monitor import RetryDeadline
 from pliant.worker.execution.progress import Reporter
 from pliant.worker.execution.workdir import OUTPUT, working_directory
 from pliant.worker.jobs import lifecycle
@@ -47,7 +47,7 @@ STATUS_INTERVAL = 0.25
 PAUSE_AFTER_SILENCE = 4.0
 """Pause after a call that the store did not answer, in durations of the call: a store that hangs slows a job down by at most a quarter."""
 
-PATIENCE = 60.0
+RETRY_SECONDS = 60.0
 """Seconds for which calls to an unavailable store are retried when claiming the job, reading its inputs and publishing its result."""
 
 
@@ -56,7 +56,7 @@ def run(id: str, attempt_id: str, *, settings: Settings, worker: str) -> None:
     jobs, now = Jobs.open(settings), datetime.now(UTC)
     claim = partial(lifecycle.claim, attempt_id=attempt_id, worker=worker, now=now)
     try:
-        stored = Patience(PATIENCE).retry(lambda: jobs.records.update(id, claim))
+        stored = RetryDeadline(RETRY_SECONDS).retry(lambda: jobs.records.update(id, claim))
     except (StaleAttempt, UnknownJob) as error:
         logger.info("delivery %s dropped: %s", attempt_id, error)
         return
@@ -169,7 +169,7 @@ class Attempt:
         StaleAttempt
             The job belongs to another attempt.
         StoreUnavailable
-            The store has not answered for `PATIENCE` seconds.
+            The store has not answered for `RETRY_SECONDS` seconds.
         """
         settings, now = self.jobs.settings, datetime.now(UTC)
 
@@ -184,10 +184,10 @@ class Attempt:
                 held, end, attempt_id=self.attempt_id, prefix=self.prefix, now=now, retention=settings.retention
             )
 
-        patience = Patience(PATIENCE)
+        deadline = RetryDeadline(RETRY_SECONDS)
         with contextlib.suppress(StoreUnavailable):
-            patience.retry(self._flush)
-        kept = patience.retry(lambda: self.jobs.records.update(self.id, change))
+            deadline.retry(self._flush)
+        kept = deadline.retry(lambda: self.jobs.records.update(self.id, change))
         if kept.prefix is None:
             self.jobs.blobs.delete(self.prefix)
         return kept.job.status.value
@@ -200,7 +200,7 @@ class Attempt:
         Interrupted
             The attempt should stop.
         StoreUnavailable
-            The blob store has not answered for `PATIENCE` seconds.
+            The blob store has not answered for `RETRY_SECONDS` seconds.
         """
         for artifact in finished.artifacts:
             key, file = f"{self.prefix}{artifact.name}", results / artifact.name
@@ -208,7 +208,7 @@ class Attempt:
             self.wait_for_store(put)
 
     def wait_for_store(self, call: Callable[[], object]) -> None:
-        """Retry a call until the store answers, for at most `PATIENCE` seconds.
+        """Retry a call until the store answers, for at most `RETRY_SECONDS` seconds.
 
         Raises
         ------
@@ -223,7 +223,7 @@ class Attempt:
                 raise Interrupted
             call()
 
-        Patience(PATIENCE).retry(wanted)
+        RetryDeadline(RETRY_SECONDS).retry(wanted)
 
     @property
     def prefix(self) -> str:

@@ -15,7 +15,7 @@ from pliant.solver.stages import planned
 from pliant.worker.artifacts import described, kinds_for
 from pliant.worker.errors import Interrupted
 from pliant.worker.execution.pace import MachinePace
-from pliant.worker.execution.pipeline import Halt, silent, solve_and_write
+from pliant.worker.execution.pipeline import StopCondition, silent, solve_and_write
 from pliant.worker.execution.progress import FILM_SHARES, Reporter
 from pliant.worker.films import frame_strip
 from pliant.worker.films.bounds import FilmBounds
@@ -59,7 +59,7 @@ def reconstruct_film(
     """
     kinds_for(options)
     reporter = Reporter(on_progress if on_progress is not None else silent, shares=FILM_SHARES)
-    halt, pace = Halt(should_stop, options.time_limit), MachinePace()
+    halt, pace = StopCondition(should_stop, options.time_limit), MachinePace()
     with reporter.ticking():
         reporter.part("track", 0.0)
         began = time.perf_counter()

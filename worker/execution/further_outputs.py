@@ -14,7 +14,7 @@ from pliant.solver import Camera, Choices, Outcome, Solution, Trace
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.artifacts.result import Result, file_warnings
 from pliant.worker.artifacts.write import write_kinds, write_report
-from pliant.worker.execution.pipeline import Halt, silent
+from pliant.worker.execution.pipeline import StopCondition, silent
 from pliant.worker.execution.progress import Reporter
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.tracker import Tracked
@@ -54,7 +54,7 @@ def write_further(
     InvalidInput
         Code damaged_file: a stored file cannot be read back.
     """
-    options, halt = job.options, Halt(should_stop, job.options.time_limit)
+    options, halt = job.options, StopCondition(should_stop, job.options.time_limit)
     reporter = Reporter(on_progress if on_progress is not None else silent, shares=SHARES)
     reporter.part("loading", 0.0)
     inputs = _inputs(inputs_file, job)

@@ -15,7 +15,7 @@ from typing import TypeVar
 from pliant.schemas.job import Problem, Status
 from pliant.worker.errors import StaleAttempt, StoreUnavailable, TimedOut, UnknownJob
 from pliant.worker.execution.failures import how_it_ended, out_of_memory, problem_of, timed_out, worker_lost
-from pliant.worker.execution.workdir import last_words
+from pliant.worker.execution.workdir import output_tail
 from pliant.worker.ids import new_attempt_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.processes.containment import OomKills
@@ -31,7 +31,7 @@ HEARTBEAT_SECONDS = 1.0
 Answer = TypeVar("Answer")
 
 
-class Patience:
+class RetryDeadline:
     """Retry calls to an unavailable store, with one time limit for all calls together."""
 
     def __init__(self, seconds: float) -> None:
@@ -130,7 +130,7 @@ class Watch:
             self._cancelled = now
 
 
-def finalize(watch: Watch, *, status: int, peak: int, patience: Patience) -> Stored | None:
+def finalize(watch: Watch, *, status: int, peak: int, deadline: RetryDeadline) -> Stored | None:
     """Record the outcome of a job process that ended without recording one; otherwise change nothing.
 
     Returns the new record, or None if unchanged. Reason and last output of the job process are logged before the record becomes
@@ -143,7 +143,7 @@ def finalize(watch: Watch, *, status: int, peak: int, patience: Patience) -> Sto
     """
     change = _verdict(watch, status=status, peak=peak)
     sentence = f"Ended by the worker: {watch.reason}." if watch.reason is not None else how_it_ended(status)
-    words = [sentence, *last_words(watch.settings, watch.attempt_id)]
+    words = [sentence, *output_tail(watch.settings, watch.attempt_id)]
 
     def record_verdict() -> Stored:
         change(watch.records.get(watch.id))  # raises if the outcome is recorded already
@@ -152,7 +152,7 @@ def finalize(watch: Watch, *, status: int, peak: int, patience: Patience) -> Sto
         return watch.records.update(watch.id, change)
 
     try:
-        settled = patience.retry(record_verdict)
+        settled = deadline.retry(record_verdict)
     except (StaleAttempt, UnknownJob):
         return None
     logger.warning("job %s: %s", watch.id, sentence)

@@ -50,7 +50,7 @@ def reconstruct(
     # Reject files that cannot be written before computing anything.
     kinds_for(options, size=(inputs.tracks.num_frames, inputs.tracks.num_points))
     reporter = Reporter(on_progress if on_progress is not None else silent)
-    halt = Halt(should_stop, options.time_limit)
+    halt = StopCondition(should_stop, options.time_limit)
     with reporter.ticking():
         return solve_and_write(inputs, options, directory, name=name, reporter=reporter, halt=halt, solver=solver)
 
@@ -61,7 +61,7 @@ def solve_and_write(
     directory: Path,
     *,
     reporter: Reporter,
-    halt: Halt,
+    halt: StopCondition,
     name: str = "",
     spent: Mapping[str, float] | None = None,
     earlier: Sequence[Artifact] = (),
@@ -125,7 +125,7 @@ def _finished(
 
 
 @dataclass(slots=True)
-class Halt:
+class StopCondition:
     """The stop condition of a job with its reason; once requested, a stop stays requested."""
 
     should_stop: Callable[[], bool] | None

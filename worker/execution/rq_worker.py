@@ -21,7 +21,7 @@ import redis
 from pliant.schemas.job import Status
 from pliant.worker.errors import StoreUnavailable, UnknownJob
 from pliant.worker.execution import attempt as work
-from pliant.worker.execution.monitor import Patience, Watch, finalize
+from pliant.worker.execution.monitor import RetryDeadline, Watch, finalize
 from pliant.worker.execution.workdir import clean_up
 from pliant.worker.jobs.lifecycle import ACTIVE
 from pliant.worker.jobs.submission import order_waiting
@@ -244,19 +244,19 @@ class PliantWorker(Worker):
             self.connection = patient
 
     def _reap(self, watch: Watch, job: RqJob, *, status: int, peak: int) -> None:
-        patience = Patience(60.0 if self._stop_by is None else 2.0)
+        deadline = RetryDeadline(60.0 if self._stop_by is None else 2.0)
         try:
-            settled = finalize(watch, status=status, peak=peak, patience=patience)
+            settled = finalize(watch, status=status, peak=peak, deadline=deadline)
             if settled is not None and settled.job.status is Status.QUEUED:
                 fresh = settled.attempt_id
-                patience.retry(lambda: self._deliveries.push(watch.id, fresh, front=True))  # it has waited before
-                patience.retry(lambda: order_waiting(self._records, self._deliveries, [settled.owner]))
-            patience.retry(lambda: self._deliveries.remove(job.id))
+                deadline.retry(lambda: self._deliveries.push(watch.id, fresh, front=True))  # it has waited before
+                deadline.retry(lambda: order_waiting(self._records, self._deliveries, [settled.owner]))
+            deadline.retry(lambda: self._deliveries.remove(job.id))
         except StoreUnavailable as error:
             logger.warning("job %s: %s; the reconciler will requeue it", watch.id, error)
         finally:
             with suppress(StoreUnavailable):  # otherwise the reconciler removes the files
-                if not patience.retry(lambda: self._elsewhere(watch)):
+                if not deadline.retry(lambda: self._elsewhere(watch)):
                     clean_up(self._settings, watch.attempt_id)
 
     def _elsewhere(self, watch: Watch) -> bool:

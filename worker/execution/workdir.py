@@ -16,7 +16,7 @@ def working_directory(settings: Settings, attempt_id: str) -> Path:
     return settings.work / attempt_id
 
 
-def last_words(settings: Settings, attempt_id: str) -> list[str]:
+def output_tail(settings: Settings, attempt_id: str) -> list[str]:
     """Return the end of an attempt's standard output and error: at most 100 lines and 16 KiB."""
     file = working_directory(settings, attempt_id) / OUTPUT
     if not file.exists():

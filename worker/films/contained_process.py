@@ -21,7 +21,7 @@ from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.frame_strip import write_frames
 from pliant.worker.formats.errors import too_large
 from pliant.worker.processes.contained import limit_process, serve
-from pliant.worker.processes.no_network import forbid_network
+from pliant.worker.processes.no_network import restrict_process
 
 if TYPE_CHECKING:
     from pliant.tracking import Film, FilmError, FilmLimits, TrackingStep
@@ -54,7 +54,7 @@ def main() -> int:
 
 
 def _answer(request: dict[str, Any]) -> str:
-    forbid_network()
+    restrict_process()
     try:
         import pliant.tracking as tracking
     except ImportError as error:

@@ -39,12 +39,12 @@ FORGOTTEN_AFTER = 3.0
 
 
 STALE_WRITES = 3600.0
-"""Seconds for which the files of a requeued job are checked again, every `retention.TIDY_EVERY` seconds: the lost worker may
+"""Seconds for which the files of a requeued job are checked again, every `retention.CLEAN_EVERY` seconds: the lost worker may
 return within this time and still store files until its next heartbeat fails."""
 
 
 @dataclass(slots=True)
-class Stillness:
+class IdleTimer:
     """Tracks how long each value has not changed, by the monotonic clock."""
 
     _seen: dict[str, tuple[object, float]] = field(default_factory=dict)
@@ -66,8 +66,8 @@ class Reconciler:
     jobs: Jobs
     clock: Callable[[], float] = time.monotonic
     retention: Retention = field(init=False)
-    _running: Stillness = field(default_factory=Stillness)
-    _queued: Stillness = field(default_factory=Stillness)
+    _running: IdleTimer = field(default_factory=IdleTimer)
+    _queued: IdleTimer = field(default_factory=IdleTimer)
     _looked: float | None = None
     _cleaned: set[str] = field(default_factory=set)
     _ended: int | None = None

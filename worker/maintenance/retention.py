@@ -16,7 +16,7 @@ from pliant.worker.uploads.shared import open_uploads
 
 logger = logging.getLogger(__name__)
 
-TIDY_EVERY = 30.0
+CLEAN_EVERY = 30.0
 """Seconds between two checks for expired jobs and uploads."""
 
 SWEEP_EVERY = 3600.0
@@ -55,14 +55,14 @@ class Retention:
             A store does not answer; nothing is lost, and the tasks stay due.
         """
         self._check_clock(now)
-        tidied = self._tidied is None or now >= self._tidied + TIDY_EVERY
+        tidied = self._tidied is None or now >= self._tidied + CLEAN_EVERY
         if tidied:
             if self._held_until is None or now >= self._held_until:
                 self._expire()
                 self._expire_uploads()
             self._clear_work()
             self._remove_deleted()
-            self.jobs.queue.tidy()
+            self.jobs.queue.clean_up()
             self._tidied = now
         if self._swept is None or now >= self._swept + SWEEP_EVERY:
             self._sweep()

@@ -36,7 +36,7 @@ class _Program(ctypes.Structure):
     _fields_ = [("length", ctypes.c_uint16), ("filter", ctypes.POINTER(_Instruction))]
 
 
-def forbid_network() -> bool:
+def restrict_process() -> bool:
     """Deny new sockets and new programs to this process for the rest of its life.
 
     Call it before starting threads: it applies to the calling thread and its descendants.

@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 FIRST_PAUSE, LONGEST_PAUSE = 0.2, 15.0
 """Seconds before an ended process is restarted; doubled each time it ends early."""
 
-GROWN_UP = 20.0
+STABLE_AFTER = 20.0
 """Seconds after which a process counts as started successfully."""
 
 POLL = 0.05
@@ -45,7 +45,7 @@ class Child:
     ready: Callable[[subprocess.Popen[bytes]], None] | None = None
     """Returns once the process is ready; at start, the next process waits for it."""
 
-    last_words: Callable[[], str] | None = None
+    log_tail: Callable[[], str] | None = None
     """Returns the last lines of its log, for the message that it ended."""
 
     foundation: bool = False
@@ -75,7 +75,7 @@ class Supervisor:
         self._running = [_Running(child) for child in children]
         self._starting = False
         self._stopping = False
-        self._hurry = False
+        self._forced = False
 
     def start(self) -> None:
         """Start all children, in order, waiting for each one's `ready`; if one fails, stop the others and raise."""
@@ -115,9 +115,9 @@ class Supervisor:
                 if now >= each.restart_at:
                     self._launch_again(each, now)
             elif (code := each.process.poll()) is not None:
-                each.pause = FIRST_PAUSE if now - each.began > GROWN_UP else min(2 * each.pause, LONGEST_PAUSE)
+                each.pause = FIRST_PAUSE if now - each.began > STABLE_AFTER else min(2 * each.pause, LONGEST_PAUSE)
                 each.process, each.restart_at = None, now + each.pause
-                last = "" if each.child.last_words is None else each.child.last_words()
+                last = "" if each.child.log_tail is None else each.child.log_tail()
                 why = f". Its log ends with: {last}" if last else ""
                 name, again = each.child.name, f"Starting it again in {each.pause:.1f} s"
                 logger.warning("%s ended with code %s%s. %s", name, code, why, again)
@@ -131,7 +131,7 @@ class Supervisor:
             began = time.monotonic()
             while alive := [each for each in group if each.process is not None and each.process.poll() is None]:
                 for each in alive:
-                    if time.monotonic() > began + each.child.grace or (self._hurry and not foundation):
+                    if time.monotonic() > began + each.child.grace or (self._forced and not foundation):
                         logger.warning("%s does not stop; killing it", each.child.name)
                         _signal(each, signal.SIGKILL)
                 time.sleep(POLL)
@@ -143,7 +143,7 @@ class Supervisor:
         return {each.child.name: each.process.pid for each in self._running if each.process is not None}
 
     def _on_signal(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        self._hurry = self._stopping
+        self._forced = self._stopping
         self._stopping = True
         if self._starting:
             self._starting = False
@@ -177,7 +177,7 @@ def valkey_child(valkey: Valkey) -> Child:
         argv=valkey.argv,
         descriptors=(valkey.server_lock,),
         ready=valkey.wait,
-        last_words=valkey.log_tail,
+        log_tail=valkey.log_tail,
         foundation=True,
         grace=15.0,
     )

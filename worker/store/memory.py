@@ -225,8 +225,8 @@ class MemoryQueue(Queue):
     def place(self, attempt_id: str) -> int | None:
         return self._attempt_ids.index(attempt_id) if attempt_id in self._attempt_ids else None
 
-    def tidy(self) -> None:
-        """See `Queue.tidy`."""
+    def clean_up(self) -> None:
+        """See `Queue.clean_up`."""
 
     def workers(self) -> list[str]:
         return ["memory"]

@@ -77,7 +77,7 @@ class Queue(ABC):
         """Sort these attempts by rank, ascending and stable, within the queue positions that they occupy."""
 
     @abstractmethod
-    def tidy(self) -> None:
+    def clean_up(self) -> None:
         """Remove entries of ended workers from RQ's records."""
 
     @abstractmethod
@@ -151,7 +151,7 @@ class RedisQueue(Queue):
         with reachable():
             self._order(keys=[self._queue.key], args=[part for each in ranks.items() for part in each])
 
-    def tidy(self) -> None:
+    def clean_up(self) -> None:
         with reachable():
             if not self._queue.acquire_maintenance_lock():
                 return

@@ -133,7 +133,7 @@ def test_a_finished_job_waits_for_an_unavailable_blob_store(
     with pytest.raises(Interrupted):
         attempt.store(finished, tmp_path)
     monkeypatch.setattr(Attempt, "should_stop", lambda self: False)
-    monkeypatch.setattr("pliant.worker.execution.attempt.PATIENCE", -1.0)
+    monkeypatch.setattr("pliant.worker.execution.attempt.RETRY_SECONDS", -1.0)
     away[0] = 1
     with pytest.raises(StoreUnavailable):
         attempt.store(finished, tmp_path)
@@ -166,7 +166,7 @@ def test_the_outcome_is_recorded_even_if_the_log_cannot_be_written(
         raise StoreUnavailable("The job store", reason="away")
 
     monkeypatch.setattr(jobs.records, "append_log", never)
-    monkeypatch.setattr("pliant.worker.execution.attempt.PATIENCE", -1.0)
+    monkeypatch.setattr("pliant.worker.execution.attempt.RETRY_SECONDS", -1.0)
     attempt.log("Failed: why.")
     attempt.conclude(PROBLEM)
     assert jobs.get(attempt.id).status is Status.FAILED

@@ -64,7 +64,7 @@ def registered(settings: Settings, inputs: tuple[Path, Path], *, beat_every: int
         os.kill(job_process, signal.SIGSTOP)  # a long job that takes no processor time; the heartbeat is the worker's
         until = time.monotonic() + LEASE + 1.5
         while time.monotonic() < until:
-            house.jobs.queue.tidy()
+            house.jobs.queue.clean_up()
             time.sleep(0.2)
         started = StartedJobRegistry(queue=queue).get_job_ids(cleanup=False)
         failed = FailedJobRegistry(queue=queue).get_job_ids(cleanup=False)

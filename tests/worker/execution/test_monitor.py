@@ -16,7 +16,7 @@ from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.worker.errors import StoreUnavailable
 from pliant.worker.execution.failures import how_it_ended, out_of_memory, problem_of, timed_out
-from pliant.worker.execution.monitor import Patience, Reason, Watch, finalize
+from pliant.worker.execution.monitor import Reason, RetryDeadline, Watch, finalize
 from pliant.worker.execution.progress import FILM_SHARES, SHARES, Reporter
 from pliant.worker.execution.workdir import OUTPUT, working_directory
 from pliant.worker.jobs import lifecycle
@@ -54,7 +54,7 @@ def test_a_cancelled_attempt_is_killed_after_its_grace(jobs: Jobs, running: Call
     for time[0] in (0.5, 1.5, 4.0, 4.5):
         found.append(watch.must_end(stop_by=None))
     assert found == [None, None, None, Reason.CANCELLED], "noticed at the beat of 1.5 s, killed 3 s later"
-    after = finalize(watch, status=KILLED, peak=0, patience=Patience(0))
+    after = finalize(watch, status=KILLED, peak=0, deadline=RetryDeadline(0))
     assert after is not None
     assert (after.job.status, after.job.error) == (Status.CANCELLED, None)
 
@@ -66,7 +66,7 @@ def test_an_attempt_that_ignores_its_time_limit_is_killed(running: Callable[...,
     assert watch.must_end(stop_by=None) is None
     time[0] = 13.0
     assert watch.must_end(stop_by=None) is Reason.TIMED_OUT
-    after = finalize(watch, status=KILLED, peak=0, patience=Patience(0))
+    after = finalize(watch, status=KILLED, peak=0, deadline=RetryDeadline(0))
     assert after is not None
     assert after.job.error is not None
     assert (after.job.error.code, "10 s" in after.job.error.detail) == ("timed_out", True)
@@ -79,7 +79,7 @@ def test_the_time_limit_option_of_a_job_is_enforced(running: Callable[..., Watch
     assert watch.must_end(stop_by=None) is None
     time[0] = 7.1
     assert watch.must_end(stop_by=None) is Reason.TIMED_OUT, "its 4 s and a grace of 3 s"
-    after = finalize(watch, status=KILLED, peak=0, patience=Patience(0))
+    after = finalize(watch, status=KILLED, peak=0, deadline=RetryDeadline(0))
     assert after is not None
     assert after.job.error is not None
     assert (after.job.error.code, "option time_limit of 4 s" in after.job.error.detail) == ("timed_out", True)
@@ -98,21 +98,21 @@ def test_a_stopping_worker_requeues_the_job_regardless_of_attempts(jobs: Jobs, r
     assert watch.must_end(stop_by=2.0) is None
     time[0] = 2.0
     assert watch.must_end(stop_by=2.0) is Reason.STOPPING
-    after = finalize(watch, status=KILLED, peak=0, patience=Patience(0))
+    after = finalize(watch, status=KILLED, peak=0, deadline=RetryDeadline(0))
     assert after is not None
     assert (after.job.status, after.job.attempt, after.worker) == (Status.QUEUED, 1, None)
     assert after.attempt_id != watch.attempt_id
     assert watch.must_end(stop_by=2.0) is Reason.STOPPING
     time[0] = 3.0
     assert watch.must_end(stop_by=2.0) is Reason.STALE
-    assert finalize(watch, status=KILLED, peak=0, patience=Patience(0)) is None
+    assert finalize(watch, status=KILLED, peak=0, deadline=RetryDeadline(0)) is None
 
 
 def test_a_job_killed_while_its_worker_stops_is_requeued(running: Callable[..., Watch]) -> None:
     for status, expected in ((KILLED, Status.QUEUED), (int(signal.SIGSEGV), Status.FAILED)):
         watch = running([0.0])
         assert watch.must_end(stop_by=100.0) is None
-        after = finalize(watch, status=status, peak=0, patience=Patience(0))
+        after = finalize(watch, status=status, peak=0, deadline=RetryDeadline(0))
         assert after is not None
         assert after.job.status is expected
 
@@ -124,7 +124,7 @@ def test_an_attempt_that_lost_its_job_is_killed_at_once(jobs: Jobs, running: Cal
     jobs.records.update(watch.id, lambda held: lifecycle.stop(held, attempt_id=watch.attempt_id, now=NOW, retention=0))
     jobs.delete(watch.id)
     assert watch.must_end(stop_by=None) is Reason.STALE
-    assert finalize(watch, status=KILLED, peak=0, patience=Patience(0)) is None
+    assert finalize(watch, status=KILLED, peak=0, deadline=RetryDeadline(0)) is None
 
 
 def test_supervision_continues_while_the_store_is_unavailable(
@@ -141,14 +141,14 @@ def test_supervision_continues_while_the_store_is_unavailable(
         assert watch.must_end(stop_by=None) is None
     monkeypatch.setattr(type(watch.records), "get", away)
     with pytest.raises(StoreUnavailable, match="try again"):
-        finalize(watch, status=KILLED, peak=0, patience=Patience(0))
+        finalize(watch, status=KILLED, peak=0, deadline=RetryDeadline(0))
 
 
 def test_crashes_and_out_of_memory_kills_are_distinguished(
     jobs: Jobs, running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def code(watch: Watch, status: int, peak: int = 0) -> str:
-        after = finalize(watch, status=status, peak=peak, patience=Patience(0))
+        after = finalize(watch, status=status, peak=peak, deadline=RetryDeadline(0))
         assert after is not None
         assert after.job.error is not None
         assert after.job.error.retryable
@@ -163,7 +163,7 @@ def test_crashes_and_out_of_memory_kills_are_distinguished(
     assert code(starved, KILLED) == "out_of_memory"
     assert code(segfault, int(signal.SIGSEGV)) == "worker_lost", "the kernel kills the hungry with SIGKILL"
     jobs.records.update(quiet.id, lambda held: held.model_copy(update={"worker": "another"}))
-    assert finalize(quiet, status=KILLED, peak=0, patience=Patience(0)) is None, (
+    assert finalize(quiet, status=KILLED, peak=0, deadline=RetryDeadline(0)) is None, (
         "a second delivery must not end the first"
     )
 
@@ -187,7 +187,7 @@ def test_calls_are_retried_until_the_store_answers(jobs: Jobs, running: Callable
             raise error
         return jobs.records.get(watch.id)
 
-    assert Patience(10).retry(call) == jobs.records.get(watch.id)  # type: ignore[arg-type]
+    assert RetryDeadline(10).retry(call) == jobs.records.get(watch.id)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -348,6 +348,6 @@ def test_the_log_is_complete_before_the_record_is_final(
         return update(self, id, change)
 
     monkeypatch.setattr(type(jobs.records), "update", seen)
-    assert finalize(watch, status=KILLED, peak=0, patience=Patience(0)) is not None
+    assert finalize(watch, status=KILLED, peak=0, deadline=RetryDeadline(0)) is not None
     assert "SIGKILL" in logged[0]
     assert logged[1:] == ["Segmentation fault"] == jobs.records.log(watch.id)[1:]

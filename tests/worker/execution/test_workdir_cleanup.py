@@ -9,7 +9,7 @@ import pytest
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.worker.errors import StoreUnavailable
-from pliant.worker.execution.monitor import Patience, Watch
+from pliant.worker.execution.monitor import RetryDeadline, Watch
 from pliant.worker.execution.rq_worker import PliantWorker
 from pliant.worker.execution.workdir import working_directory
 from pliant.worker.jobs import lifecycle
@@ -27,13 +27,13 @@ def test_all_retried_calls_share_one_time_limit() -> None:
         asked.append("again")
         raise StoreUnavailable("The store", reason="gone")
 
-    patience = Patience(0.7)
+    deadline = RetryDeadline(0.7)
     with pytest.raises(StoreUnavailable):
-        patience.retry(gone)
+        deadline.retry(gone)
     assert len(asked) > 1
     asked.clear()
     with pytest.raises(StoreUnavailable):
-        patience.retry(gone)
+        deadline.retry(gone)
     assert asked == ["again"], "tried once, though the time is over"
 
 

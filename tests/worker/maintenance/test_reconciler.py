@@ -15,12 +15,12 @@ import pytest
 from pliant.schemas.job import Interpretation, Problem, Status
 from pliant.schemas.options import Options
 from pliant.worker.errors import StoreUnavailable, UnknownJob
-from pliant.worker.execution.workdir import clean_up, last_words, working_directory
+from pliant.worker.execution.workdir import clean_up, output_tail, working_directory
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
 from pliant.worker.maintenance.fsck import findings
-from pliant.worker.maintenance.reconciler import Reconciler, Stillness
+from pliant.worker.maintenance.reconciler import IdleTimer, Reconciler
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.uploads.service import Capacity, Uploads
@@ -231,7 +231,7 @@ def test_the_reconciler_survives_an_unavailable_store(world: World, monkeypatch:
 
 
 def test_silent_time_counts_only_while_the_heartbeat_is_unchanged() -> None:
-    still = Stillness()
+    still = IdleTimer()
     assert still.look({"a": 1}, 5.0) == {"a": 0.0}
     assert still.look({"a": 1, "b": 1}, 2.0) == {"a": 2.0, "b": 0.0}
     assert still.look({"a": 2, "b": 1}, 2.0) == {"a": 0.0, "b": 2.0}
@@ -241,11 +241,11 @@ def test_silent_time_counts_only_while_the_heartbeat_is_unchanged() -> None:
 
 def test_the_last_100_lines_of_output_are_read(tmp_path: Path) -> None:
     settings = Settings(data=tmp_path)
-    assert last_words(settings, "t-1") == []
+    assert output_tail(settings, "t-1") == []
     directory = working_directory(settings, "t-1")
     directory.mkdir(parents=True)
     (directory / "output.log").write_text("".join(f"line {number}\n" for number in range(5000)))
-    words = last_words(settings, "t-1")
+    words = output_tail(settings, "t-1")
     assert (len(words), words[-1]) == (100, "line 4999")
     clean_up(settings, "t-1")
     clean_up(settings, "t-1")

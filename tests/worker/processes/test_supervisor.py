@@ -44,7 +44,7 @@ SLEEP = "import time; time.sleep(600)"
 
 
 def test_the_log_of_a_child_that_ended_is_quoted(caplog: pytest.LogCaptureFixture) -> None:
-    supervisor = Supervisor([python("short", "raise SystemExit(3)", last_words=lambda: "No space left on device")])
+    supervisor = Supervisor([python("short", "raise SystemExit(3)", log_tail=lambda: "No space left on device")])
     supervisor.start()
     until(lambda: supervisor.look() or caplog.records)
     words = "short ended with code 3. Its log ends with: No space left on device. Starting it again in"
