@@ -97,8 +97,9 @@ async def receive_form(request: Request, folder: Path, *, rules: FormRules) -> F
         raise Refusal(
             ProblemCode.UNSUPPORTED_MEDIA_TYPE,
             detail="The body must be a form: send multipart/form-data with a part `tracks`. An example is at /docs.",
+            field="Content-Type",
             expected="multipart/form-data",
-            got=kind.decode("latin-1") or "no Content-Type",
+            got=kind.decode("latin-1") or "nothing",
         )
     if not parameters.get(b"boundary"):
         raise _malformed("the Content-Type names no boundary")
@@ -120,10 +121,16 @@ async def batches(request: Request, *, max_bytes: int, stall_seconds: float) -> 
     Raises
     ------
     Refusal
-        413: the declared or actual size exceeds `max_bytes`; 408: no byte arrives for `stall_seconds`.
+        415: the body is encoded; 413: the declared or actual size exceeds `max_bytes`; 408: no byte arrives for `stall_seconds`.
     ClientDisconnect
         The body is incomplete. Then, and before a 408, the bytes that have arrived are yielded first.
     """
+    coding = request.headers.get("content-encoding", "").strip().lower()
+    if coding not in ("", "identity"):  # an inflated body could be far larger than any limit
+        raise wrong_input(
+            ProblemCode.UNSUPPORTED_MEDIA_TYPE, field="Content-Encoding", expected="a body that is not compressed", got=coding[:80],
+            hint="Send it as it is; npz files and films are compressed already.", headers={"Accept-Encoding": "identity"},
+        )  # fmt: skip
     declared = request.headers.get("content-length", "")
     if declared.isdecimal() and int(declared) > max_bytes:
         raise _too_large(max_bytes, f"{declared} bytes declared")

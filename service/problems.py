@@ -139,9 +139,10 @@ def from_validation(errors: Sequence[Any], *, options: bool = False) -> Refusal:
         code = ProblemCode(fault.code)
         return wrong_input(code, field=fault.field, expected=fault.expected, got=fault.got, hint=hint)
     where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", "header")]
+    got = "nothing" if first["type"] == "missing" else shown(first.get("input"))
     return wrong_input(
-        ProblemCode.INVALID_REQUEST, field=".".join(where) or "request", expected=expectation(first),
-        got=shown(first.get("input")), hint=f"Compare with the schema at /docs.{others}",
+        ProblemCode.INVALID_REQUEST, field=".".join(where) or "request", expected=expectation(first), got=got,
+        hint=f"Compare with the schema at /docs.{others}",
     )  # fmt: skip
 
 

@@ -325,11 +325,17 @@ def parse_options(text: str) -> Options:
     except (ValueError, RecursionError):
         raise _not_an_object("text that is not JSON") from None
     if not isinstance(given, dict):
-        raise _not_an_object(f"a JSON {type(given).__name__}")
+        raise _not_an_object(JSON_KINDS[type(given)])
     try:
         return Options.model_validate(given)
     except ValidationError as error:
         raise from_validation(error.errors(), options=True) from None
+
+
+JSON_KINDS = {
+    list: "a JSON list", str: "a JSON string", int: "a number", float: "a number", bool: "true or false", type(None): "null",
+}  # fmt: skip
+"""What JSON other than an object is called in messages."""
 
 
 def _not_an_object(got: str) -> Refusal:

@@ -6,6 +6,9 @@ from collections.abc import Iterator
 
 from pliant.solver.pulse import pulse
 
+MAX_COORDINATE = 1e12
+"""Largest absolute coordinate that is accepted, the tracks' unit; squares and fourth powers of far larger ones overflow."""
+
 LEARNED_FRAMES = 240
 """Maximum number of frames of a film from which cameras and covariance are learned; of a longer one, every n-th frame is used, and the
 cameras of the others follow by resection (`reconstruction.long_films`). More frames take longer where perspective is found, and the same

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pliant.solver.errors import numeric, shape_text, wrong_input
-from pliant.solver.limits import frame_chunks
+from pliant.solver.limits import MAX_COORDINATE, frame_chunks
 from pliant.solver.storage import allocated, let_go
 
 MIN_FRAMES = 3
@@ -56,7 +56,7 @@ class Tracks:
         OSError
             The folder `scratch` is missing, cannot be written to, or has too little space.
         InvalidInput
-            Wrong shape or type, F < 3, P < 4, confidence outside [0, 1], or no visible observation.
+            Wrong shape or type, F < 3, P < 4, confidence outside [0, 1], no visible observation, or one further than 1e12 from zero.
         """
         given = numeric(points, "tracks", "Convert the array to float.")
         if given.ndim != 3 or given.shape[2] != 2:
@@ -74,10 +74,17 @@ class Tracks:
             )
         positions = allocated((frames, count, 2), scratch)  # in C order: results must not depend on the memory layout
         confidence = _confidence(visible, (frames, count), scratch)
+        beyond = 0
         for some in frame_chunks(frames, count):
             positions[some] = given[some]
             confidence[some][~np.isfinite(positions[some]).all(axis=2)] = 0.0
             positions[some][confidence[some] == 0] = 0.0
+            beyond += int((np.abs(positions[some]) > MAX_COORDINATE).any(axis=2).sum())
+        if beyond > 0:
+            raise wrong_input(
+                "tracks", "out_of_range", f"visible coordinates within ±{MAX_COORDINATE:g}", f"{beyond:,} of them beyond",
+                "Mark them as hidden, or set them to NaN.",
+            )  # fmt: skip
         if not any(confidence[some].any() for some in frame_chunks(frames, count)):
             raise wrong_input(
                 "tracks", "nothing_visible", "at least one finite, visible observation", "none",

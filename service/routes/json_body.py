@@ -26,7 +26,8 @@ async def read_json(request: Request, model: type[Model]) -> Model:
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind not in ("", "application/json"):
         detail = "The body must be JSON: send it with `Content-Type: application/json`. An example is at /docs."
-        raise Refusal(ProblemCode.UNSUPPORTED_MEDIA_TYPE, detail=detail, expected="application/json", got=kind[:80])
+        code = ProblemCode.UNSUPPORTED_MEDIA_TYPE
+        raise Refusal(code, detail=detail, field="Content-Type", expected="application/json", got=kind[:80])
     pieces = batches(request, max_bytes=settings.max_text_bytes, stall_seconds=settings.stall_seconds)
     body = b"".join([piece async for piece in pieces])
     try:

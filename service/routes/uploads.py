@@ -66,7 +66,7 @@ _BODY = {
         "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
     }
 }
-_ERRORS = problems(400, 401, 403, 404, 408, 409, 413, 422, 429, 503, 507)
+_ERRORS = problems(400, 401, 403, 404, 408, 409, 413, 415, 422, 429, 503, 507)
 
 _DIGEST = re.compile(r"([a-z*][a-z0-9_.*-]*)=:([A-Za-z0-9+/=]*):")
 """A member of a Repr-Digest: a byte sequence in a dictionary of structured fields (RFC 8941)."""

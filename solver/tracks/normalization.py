@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.errors import InvalidInput, NotFinite
+from pliant.solver.errors import InvalidInput
 from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats, Tracks, read_only
 from pliant.solver.tracks.frame_selection import between
@@ -46,8 +46,6 @@ def normalize(tracks: Tracks) -> Normalized:
     ------
     InvalidInput
         Every visible point lies at its frame's centroid.
-    NotFinite
-        The coordinates are so large that their squares overflow.
     """
     seen = tracks.visible > 0
     weight = np.where(_near(tracks, seen), tracks.visible, 0.0)
@@ -63,8 +61,6 @@ def normalize(tracks: Tracks) -> Normalized:
         points[frame, mask] = tracks.points[frame, mask] - centroid[frame]
     pulse()
     unit = float(np.sqrt(np.einsum("fp,fpc,fpc->", weight, points, points) / total.sum()))
-    if not np.isfinite(unit):
-        raise NotFinite("the squared size of the tracks is not a finite number")
     if not unit > 1e-12 * max(float(np.abs(centroid).max()), np.finfo(float).tiny):
         raise InvalidInput(
             "no_extent", field="tracks", expected="points that differ from each other", got="one position for all points",

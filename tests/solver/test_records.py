@@ -43,6 +43,11 @@ class TestTracks:
         assert tracks.visible[1, 2] == 0
         assert tracks.visible.sum() == tracks.visible.size - 1
 
+    def test_a_hidden_observation_may_be_anywhere(self) -> None:
+        points, visible = np.where(POINTS == 7, 1e300, POINTS), np.ones(POINTS.shape[:2])
+        visible[(points > 1e12).any(axis=2)] = 0
+        assert Tracks.from_arrays(points, visible).points.max() == POINTS.max()
+
     def test_fractional_confidence_is_kept_and_zero_is_hidden(self) -> None:
         visible = np.full((5, 6), 0.25)
         visible[4] = 0
@@ -73,6 +78,9 @@ class TestTracks:
             (POINTS[:2], None, "tracks", "too_few_frames"),
             (POINTS[:, :3], None, "tracks", "too_few_points"),
             (POINTS * np.nan, None, "tracks", "nothing_visible"),
+            (POINTS * 1e153, None, "tracks", "out_of_range"),
+            (POINTS * 1e300, None, "tracks", "out_of_range"),
+            (np.where(POINTS == 7, -1e13, POINTS), None, "tracks", "out_of_range"),
             (POINTS, np.zeros((5, 6)), "tracks", "nothing_visible"),
             (POINTS, np.ones((6, 5)), "visibility", "wrong_shape"),
             (POINTS, np.ones((5, 6)).astype(str), "visibility", "wrong_type"),

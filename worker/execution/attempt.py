@@ -11,6 +11,7 @@ import faulthandler
 import logging
 import os
 import resource
+import shutil
 import threading
 import time
 import traceback
@@ -87,6 +88,8 @@ def _conclude(attempt: Attempt, stored: Stored, *, worker: str, settings: Settin
                 return attempt.conclude(attempt.failed(error))
             with limited_memory(settings.memory_limit):
                 end = work(attempt, stored, directory)
+            if isinstance(end, Problem):
+                attempt.discard(directory)
             return attempt.conclude(end)
         except (StaleAttempt, UnknownJob) as error:
             logger.info("attempt %s ended: %s", attempt.attempt_id, error)
@@ -160,6 +163,16 @@ class Attempt:
         if problem.code in ("internal_error", "storage_failed", "store_unavailable", "out_of_memory"):
             self.log("".join(traceback.format_exception(error)))
         return problem
+
+    def discard(self, directory: Path) -> None:
+        """Remove the files of a failed attempt, except its output: on a full disk, the store of records needs their space."""
+        for path in directory.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            elif path.name != OUTPUT:
+                path.unlink(missing_ok=True)
+        with contextlib.suppress(StoreUnavailable):
+            self.jobs.blobs.delete(self.prefix)
 
     def conclude(self, end: Finished | Problem | None) -> str:
         """Record the outcome: the result, the problem, or None for a stop on request. Return the job's status.

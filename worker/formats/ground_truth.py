@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import InvalidInput, KnownCamera
+from pliant.solver.limits import MAX_COORDINATE
 from pliant.worker.formats.errors import missing_array
 from pliant.worker.formats.reading.containers import read_arrays, shapes_in
-from pliant.worker.formats.records import MAX_COORDINATE, Arrays, Limits
+from pliant.worker.formats.records import Arrays, Limits
 from pliant.worker.formats.tracks.interpretation import Understood
 from pliant.worker.formats.tracks.tracker_formats import TRUE_ROTATIONS, TRUE_SHAPES, short_names
 

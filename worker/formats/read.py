@@ -12,6 +12,7 @@ from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, KnownCamera, Mesh, Tracks
 from pliant.solver.agreement import check_agreement, check_principal_point, check_seen
+from pliant.solver.limits import MAX_COORDINATE
 from pliant.solver.tracks.normalization import normalize
 from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.errors import MAX_NAMES, too_large
@@ -19,7 +20,7 @@ from pliant.worker.formats.ground_truth import read_rotations, read_truth
 from pliant.worker.formats.meshes.surface import Surface, check_order, read_surface, whole_grid
 from pliant.worker.formats.meshes.triangulation import triangulate
 from pliant.worker.formats.reading.containers import read_arrays, shapes_in
-from pliant.worker.formats.records import MAX_COORDINATE, GroundTruth, Inputs, Limits, Selection
+from pliant.worker.formats.records import GroundTruth, Inputs, Limits, Selection
 from pliant.worker.formats.solver_settings import solver_settings
 from pliant.worker.formats.tracks.decimation import thin
 from pliant.worker.formats.tracks.film_tracks import FilmTracks, read_film_tracks, tracks_options

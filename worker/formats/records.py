@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pliant.solver import InvalidInput, KnownCamera, Mesh, Tracks
+from pliant.solver.limits import MAX_COORDINATE
 
 if TYPE_CHECKING:  # not needed in the sandbox process
     from pliant.schemas.job import Interpretation
@@ -15,10 +16,6 @@ if TYPE_CHECKING:  # not needed in the sandbox process
 
 Arrays = dict[str, NDArray[np.generic]]
 """Named arrays of a file, not yet interpreted; members of nested structures have dotted names."""
-
-
-MAX_COORDINATE = 1e12
-"""Largest absolute coordinate that is accepted; squares of larger ones may overflow."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

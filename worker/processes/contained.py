@@ -8,6 +8,7 @@ Long-running processes may send progress over a pipe, one JSON object per line.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import select
@@ -23,8 +24,8 @@ from typing import Any
 from pliant.schemas.invalid import SIDES, Invalid, members_of
 from pliant.worker.processes.containment import die_with_parent
 
-DONE, REFUSED = 0, 3
-"""Exit codes of a process that succeeded, and of one that rejected its input."""
+DONE, REFUSED, DISK_FULL = 0, 3, 4
+"""Exit codes of a process that succeeded, of one that rejected its input, and of one that found the disk full."""
 
 MAX_ANSWER = 1 << 20
 """Maximum bytes of an answer that the parent reads."""
@@ -73,6 +74,11 @@ def run_contained(
     It is killed after `seconds` of wall time, or once `should_stop`, called every `POLL` seconds, returns True. Its environment
     consists of `environment` and the variables that limit the numerical libraries to one thread. `on_line` is called with every
     JSON object that it writes to the descriptor `progress` of its request.
+
+    Raises
+    ------
+    OSError
+        ENOSPC: the disk is full, here or for the process.
     """
     with _Progress(on_line) as progress:
         stated = dict(request) if progress.target is None else {**request, "progress": progress.target}
@@ -114,6 +120,8 @@ def _run(
             if process.returncode is None:
                 process.kill()
                 process.wait()
+        if process.returncode == DISK_FULL:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         answer.seek(0)
         errors.seek(max(0, errors.seek(0, os.SEEK_END) - ERRORS_KEPT))
         last = errors.read().decode(errors="replace")
@@ -183,11 +191,16 @@ def serve(handle: Callable[[dict[str, Any]], str]) -> int:
     """Run as the contained process: read the request, call `handle`, write its answer or error; return the exit code."""
     die_with_parent(int(sys.argv[1]))
     try:
-        answer, code = handle(json.load(sys.stdin)), DONE
-    except Invalid as error:
-        answer, code = json.dumps({"code": error.code, **members_of(error)}), REFUSED
-    sys.stdout.write(answer)
-    sys.stdout.flush()
+        try:
+            answer, code = handle(json.load(sys.stdin)), DONE
+        except Invalid as error:
+            answer, code = json.dumps({"code": error.code, **members_of(error)}), REFUSED
+        sys.stdout.write(answer)
+        sys.stdout.flush()
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        os._exit(DISK_FULL)  # without another attempt to write what is buffered, which would change the exit code
     return code
 
 

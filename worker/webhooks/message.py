@@ -35,6 +35,11 @@ def parse_webhook(url: str, secret: str, *, networks: str = "") -> Webhook | Non
     """
     if not url and not secret:
         return None
+    if not url:
+        raise InvalidRequest(
+            "invalid_webhook", field="webhook", expected="an address beside webhook_secret", got="nothing",
+            hint="Give the address that receives the finished job, or omit webhook_secret.",
+        )  # fmt: skip
     parts = _split(url)
     host = parts.hostname if parts is not None else None
     if parts is None or parts.scheme not in ("http", "https") or not host or parts.username is not None:
@@ -52,7 +57,7 @@ def parse_webhook(url: str, secret: str, *, networks: str = "") -> Webhook | Non
             hint="The operator can allow its network with PLIANT_WEBHOOK_NETWORKS.",
         )  # fmt: skip
     if _key(secret) is None:
-        got = "none" if not secret else f"{len(secret)} characters"
+        got = f"{len(secret)} characters" if secret else "nothing"
         raise InvalidRequest(
             "invalid_webhook_secret", field="webhook_secret",
             expected=f"{SECRET_PREFIX} and {SECRET_BYTES.start} to {SECRET_BYTES.stop - 1} random bytes in base64", got=got,

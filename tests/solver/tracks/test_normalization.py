@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pliant.solver import InvalidInput, NotFinite, Tracks
+from pliant.solver import InvalidInput, Tracks
 from pliant.solver.tracks.normalization import normalize
 
 
@@ -47,12 +47,6 @@ def test_one_extreme_outlier_does_not_change_the_unit() -> None:
     found = normalize(Tracks.from_arrays(points))
     assert 0.9 < found.unit / clean.unit < 1.1
     assert np.abs(found.points[3, 4]).min() > 1e5
-
-
-@pytest.mark.parametrize("factor", [1e153, 1e200, 1e300])
-def test_coordinates_whose_squares_overflow_are_rejected(factor: float) -> None:
-    with np.errstate(over="ignore"), pytest.raises(NotFinite, match="squared size"):
-        normalize(Tracks.from_arrays(some_tracks() * factor))
 
 
 def test_coincident_points_are_rejected() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import subprocess
 import sys
 import threading
@@ -9,6 +10,7 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from pliant.schemas.job import Artifact, Interpretation, Progress, Status
@@ -20,6 +22,7 @@ from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.finished import Finished
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
+from pliant.worker.processes.contained import run_contained
 from pliant.worker.records import Stored
 from pliant.worker.store.blobs import Blobs
 from worker_house import SHORT, make_inputs
@@ -273,6 +276,58 @@ def test_a_scratch_folder_that_cannot_be_made_fails_the_job_with_its_cause(
     assert job.error is not None
     assert job.error.code == "storage_failed"
     assert "NotADirectoryError" in jobs.log(id)
+
+
+def test_a_full_disk_is_named_and_freed_before_the_failure_is_recorded(
+    jobs: Jobs, tmp_path: Path, interpretation: Interpretation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a disk that they share, the store of records cannot record anything while the files of the job fill it."""
+    held: list[list[str]] = []
+    written = jobs.records.update
+
+    def update(id: str, change: Callable[[Stored], Stored]) -> Stored:
+        kept = written(id, change)
+        if kept.job.status is Status.FAILED:
+            held.append(sorted(path.name for path in (jobs.settings.work / kept.attempt_id).iterdir()))
+        return kept
+
+    def fill(_: object, __: object, results: Path, **___: object) -> Finished:
+        results.mkdir()
+        (results / "shapes.npz").write_bytes(bytes(1000))
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Jobs, "open", lambda _: jobs)
+    monkeypatch.setattr(jobs.records, "update", update)
+    monkeypatch.setattr("pliant.worker.execution.pipeline.reconstruct", fill)
+    make_inputs(tmp_path / "inputs.npz", frames=6, points=40)
+    id = jobs.submit(tmp_path / "inputs.npz", Submission(options=Options()), interpretation=interpretation).id
+    run(id, jobs.records.get(id).attempt_id, settings=jobs.settings, worker="w")
+    job = jobs.get(id)
+    assert job.error is not None
+    assert job.error.code == "storage_failed"
+    assert "(No space left on device). Free disk space" in job.error.detail
+    assert held == [["output.log"]]
+
+
+FULL = """
+import errno, sys
+from pliant.worker.processes.contained import serve
+def handle(request):
+    raise OSError(errno.ENOSPC, "No space left on device")
+sys.exit(serve(handle))
+"""
+
+
+def test_a_full_disk_in_a_contained_process_is_an_error_of_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    popen = subprocess.Popen
+
+    def started(command: list[str], **more: Any) -> subprocess.Popen[bytes]:
+        return popen([command[0], "-c", FULL, command[-1]], **more)
+
+    monkeypatch.setattr("pliant.worker.processes.contained.subprocess.Popen", started)
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        run_contained("any", {}, seconds=30)
+    assert problem_of(caught.value).code == "storage_failed"
 
 
 def test_a_memory_limit_above_the_limit_of_the_process_has_no_effect() -> None:

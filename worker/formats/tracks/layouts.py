@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
+from pliant.solver.limits import MAX_COORDINATE
 from pliant.solver.records import MIN_FRAMES, MIN_POINTS
 from pliant.worker.formats.errors import AmbiguousInput
-from pliant.worker.formats.records import MAX_COORDINATE
 from pliant.worker.formats.tracks.tracker_formats import Dialect
 
 CONTRADICTED = 5.0

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
+from pliant.solver.limits import MAX_COORDINATE
 from pliant.worker.formats.errors import AmbiguousInput
-from pliant.worker.formats.records import MAX_COORDINATE
 
 MAX_COMPARED = 100_000
 SLACK = 0.02
