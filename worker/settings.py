@@ -98,7 +98,8 @@ class Settings:
     """Time for which a finished job and its files are kept; 0: indefinitely."""
 
     disk_quota: Bytes = 0
-    """Maximum total bytes of jobs and uploads, above which new ones are rejected; 0: no quota."""
+    """Maximum total bytes of jobs and uploads, above which new ones are rejected; 0: no quota. Results of accepted jobs are stored beyond
+    it, too: leave room for them on the disk."""
 
     read_memory: int = Field(default=8 << 30, ge=1 << 30, description="a whole number of bytes, at least 1 GiB")
     """Limit on the address space of the process that reads large inputs; inputs that need more are rejected as too_large."""

@@ -120,4 +120,7 @@ def _unlike(free: Floats, isometric: Floats) -> float:
 
 
 def _weak_evidence_warning(unlike: float) -> str:
-    return f"The evidence for constant lengths is weak, and a free surface differs by {unlike:.0%} of the size. Compare with surface=free."
+    return (
+        f"The evidence for constant lengths is weak, and a free surface differs by {unlike:.0%} of the size. Solve with surface=free, too, "
+        "and look at both from the side: this one suits paper and cloth, the free one what stretches or tears."
+    )

@@ -135,7 +135,7 @@ def unused_arrays(path: Path, understood: Understood, *, has_mesh: bool, has_tru
     cameras = any(name in TRUE_ROTATIONS for name, _ in unknown)
     return [
         f"Not used: {listed}{more}."
-        + (" Send a mesh as the part mesh." if mesh else "")
+        + (" Send this file as the mesh, too, to use its mesh." if mesh else "")
         + (" Send given cameras as the part rotations." if cameras else "")
     ]
 

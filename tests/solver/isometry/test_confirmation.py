@@ -103,7 +103,7 @@ def test_weak_evidence_decides_only_against_a_free_surface_that_differs() -> Non
     assert chosen.choices.reasons["surface"].startswith("Taken as an isometric sheet")
     assert chosen.trust is not None
     assert chosen.trust.verdict is Verdict.WITH_CARE
-    assert "Compare with surface=free." in chosen.trust.reasons[0]
+    assert "Solve with surface=free, too, and look at both from the side" in chosen.trust.reasons[0]
 
 
 def test_fewer_than_two_frames_per_half_confirm_nothing() -> None:

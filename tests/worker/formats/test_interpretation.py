@@ -199,7 +199,9 @@ def test_arrays_that_are_not_used_are_listed(tmp_path: Path) -> None:
         f"Not used: weights ({F}, {P}), faces (1, 3), text."
     ]
     without = read_inputs(tracks=tmp_path / "tracks.npz", options=Options()).interpretation.notes
-    assert any(note.endswith("text. Send a mesh as the part mesh.") for note in without)
+    assert any(note.endswith("text. Send this file as the mesh, too, to use its mesh.") for note in without)
+    same = read_inputs(tracks=tmp_path / "tracks.npz", mesh=tmp_path / "tracks.npz", options=Options())
+    assert (same.interpretation.mesh_source, same.interpretation.num_faces) == ("given", 1)
     many = {f"array_{number}": np.ones(2) for number in range(12)}
     (listed,) = [
         each for each in read(tmp_path, {"tracks": POINTS, **many}).interpretation.notes if each.startswith("Not used")

@@ -110,6 +110,43 @@ def test_only_expired_jobs_are_removed(world: World, submit: Callable[[World], s
     assert all(early not in key for key, _ in world.jobs.blobs.list("jobs/"))
 
 
+def test_records_that_cannot_have_expired_are_read_once_an_hour(
+    world: World, submit: Callable[[World], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reading a hundred thousand records takes longer than the pause between two checks."""
+    read: list[str] = []
+    page = type(world.jobs).page
+
+    def noted(jobs: Jobs, **given: Any) -> Any:
+        found = page(jobs, **given)
+        read.extend(job.id for job in found.jobs if "cursor" in given)  # not those that others read
+        return found
+
+    kept = submit(world)
+    world.jobs.cancel(kept)
+    stored = world.jobs.records.get(kept)
+    late = stored.job.model_copy(update={"expires_at": world.now + timedelta(days=9)})  # of a longer period
+    world.jobs.records.replace(stored, stored.model_copy(update={"job": late, "version": stored.version + 1}))
+    monkeypatch.setattr(type(world.jobs), "page", noted)
+    world.pass_seconds(35)
+    assert read == []  # it is younger than the retention of 60 s
+    world.pass_seconds(60)
+    assert set(read) == {kept}
+    early = submit(world)
+    world.jobs.cancel(early)
+    stored = world.jobs.records.get(early)
+    soon = stored.job.model_copy(update={"created_at": world.now + timedelta(days=1), "expires_at": world.now})
+    world.jobs.records.delete(stored, at=world.now)
+    world.jobs.records.create(stored.model_copy(update={"job": soon}))  # looks younger than it is
+    world.pass_seconds(60)
+    assert world.jobs.get(early).status is Status.CANCELLED
+    world.monotonic += 3600
+    world.now += timedelta(hours=1)
+    world.pass_seconds(1)
+    with pytest.raises(UnknownJob):
+        world.jobs.get(early)
+
+
 def test_a_new_job_under_an_expired_ones_id_is_kept(
     world: World, submit: Callable[[World], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
