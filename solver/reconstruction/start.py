@@ -164,26 +164,30 @@ def prepared(
     if prior is None:
         estimate, covariance = cameras.estimate, None
         settings = without_learned_prior(settings)
-    elif settings.gaussian:
-        estimate, covariance = estimate_with(cameras, prior), prior.normalized
     else:
-        raise InvalidSettings(
-            "invalid_option", field="settings.prior", expected="gaussian, with method robust and preset auto, with a learned prior",
-            got=f"prior {settings.prior}, method {settings.method}, preset {settings.preset}",
-            hint="Pass prior=None for the priors that are not learned.",
-        )  # fmt: skip
-    if len(estimate.rotations) != tracks.num_frames or (
-        covariance is not None and len(covariance.modes) != tracks.num_frames
-    ):
-        raise InvalidInput(
-            "camera_mismatch", field="prior", expected=f"a prior of {tracks.num_frames} frames, as many as the tracks have",
-            got=f"{0 if covariance is None else len(covariance.modes)}", hint="Learn the prior from tracks of the same frames.",
-        )  # fmt: skip
+        _check_prior(prior, tracks, settings)
+        estimate, covariance = estimate_with(cameras, prior), prior.normalized
     flat = orthographic(observations.normalized, estimate.perspective)
     return _begun(
         observations, mesh, settings, flat, estimate, covariance, cameras.outliers,
         moving=moving, bending=bending, should_stop=should_stop,
     )  # fmt: skip
+
+
+def _check_prior(prior: Prior, tracks: Tracks, settings: Settings) -> None:
+    """Check that a learned prior is what the settings select, and has as many frames as the tracks."""
+    if not settings.gaussian:
+        raise InvalidSettings(
+            "invalid_option", field="settings.prior", expected="gaussian, with method robust and preset auto, with a learned prior",
+            got=f"prior {settings.prior}, method {settings.method}, preset {settings.preset}",
+            hint="Pass prior=None for the priors that are not learned.",
+        )  # fmt: skip
+    frames = len(prior.normalized.modes)
+    if frames != tracks.num_frames:
+        raise InvalidInput(
+            "camera_mismatch", field="prior", expected=f"a prior of {tracks.num_frames} frames, as many as the tracks have",
+            got=f"{frames}", hint="Learn the prior from tracks of the same frames.",
+        )  # fmt: skip
 
 
 def _begun(
