@@ -184,8 +184,16 @@ def _factorized(
     entries: list[Candidate] = []
     for each in upgrades(gram, sizes):
         factorized.append(each)
-        thinned = Upgrade(each.basis_size, each.rotations[used], each.scales[used], each.residual)
-        entries.append(with_fixed_rotations(part, thinned, ordered=ordered, should_stop=should_stop))
+        entries.append(
+            with_fixed_rotations(
+                part,
+                each.rotations[used],
+                each.basis_size,
+                smooth_start=False,
+                ordered=ordered,
+                should_stop=should_stop,
+            )
+        )
         if should_stop is not None and should_stop():
             break
     return factorized, entries

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.factorization import Upgrade
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, Motion, Scene, cameras_of, fit, start
 from pliant.solver.model.so3 import exponential, logarithm, nearest
 from pliant.solver.records import Floats
@@ -75,15 +74,23 @@ class Candidate:
 
 def with_fixed_rotations(
     gram: Floats,
-    upgrade: Upgrade,
+    rotations: Floats,
+    basis_size: int,
     *,
-    ordered: bool = True,
-    should_stop: Callable[[], bool] | None = None,
+    smooth_start: bool,
+    ordered: bool,
+    should_stop: Callable[[], bool] | None,
 ) -> Candidate:
-    """Return the cameras of a factorization, and their energy with the rotations fixed and every scale 1."""
-    return _entered(
-        gram, upgrade.rotations, upgrade.basis_size, smooth_start=False, ordered=ordered, should_stop=should_stop
+    """Return cameras, such as those of a factorization, and their energy with the rotations fixed and every scale 1."""
+    scene = Scene.of(gram, rotations, with_scales=False, prior_weight=scaled_prior_weight(gram), ordered=ordered)
+    motion, energy = fit(
+        scene,
+        start(scene, np.ones(len(rotations))),
+        iterations=FIXED_ROTATION_ITERATIONS,
+        turning=False,
+        should_stop=should_stop,
     )
+    return Candidate(basis_size, smooth_start, scene, motion, energy)
 
 
 def run_multistart(
@@ -145,7 +152,9 @@ def smooth_start(gram: Floats, candidate: Candidate, *, should_stop: Callable[[]
         calm, start(calm, scales), iterations=SMOOTH_START_ITERATIONS, turning=True, should_stop=should_stop
     )
     turned, _ = cameras_of(calm, motion)
-    return _entered(gram, turned, candidate.basis_size, smooth_start=True, ordered=True, should_stop=should_stop)
+    return with_fixed_rotations(
+        gram, turned, candidate.basis_size, smooth_start=True, ordered=True, should_stop=should_stop
+    )
 
 
 def carried(rotations: Floats, best: Floats, used: NDArray[np.intp]) -> Floats:
@@ -167,26 +176,6 @@ def carried(rotations: Floats, best: Floats, used: NDArray[np.intp]) -> Floats:
     corrections = logarithm(turns @ common.T)
     blended = between(used, corrections, len(rotations))
     return np.asarray(rotations @ exponential(blended) @ common)
-
-
-def _entered(
-    gram: Floats,
-    rotations: Floats,
-    basis_size: int,
-    *,
-    smooth_start: bool,
-    ordered: bool,
-    should_stop: Callable[[], bool] | None,
-) -> Candidate:
-    scene = Scene.of(gram, rotations, with_scales=False, prior_weight=scaled_prior_weight(gram), ordered=ordered)
-    motion, energy = fit(
-        scene,
-        start(scene, np.ones(len(rotations))),
-        iterations=FIXED_ROTATION_ITERATIONS,
-        turning=False,
-        should_stop=should_stop,
-    )
-    return Candidate(basis_size, smooth_start, scene, motion, energy)
 
 
 def scaled_prior_weight(gram: Floats) -> float:
