@@ -27,9 +27,7 @@ class Solved:
 
     x: Array
     iterations: int
-    relative: float
-    """Ratio of the final to the initial preconditioned residual norm √(rᵀM⁻¹r)."""
-    decrease: float = 0.0
+    decrease: float
     """Decrease of xᵀ𝒜x − 2bᵀx."""
 
 
@@ -62,8 +60,8 @@ def conjugate_gradient(
     pulse()
     direction = np.empty_like(b)
     direction[...] = z
-    first = rz = dot(residual, z)
-    enough = max(negligible, max(reduction, 10 * float(np.finfo(b.dtype).eps)) ** 2 * first)
+    rz = dot(residual, z)
+    enough = max(negligible, max(reduction, 10 * float(np.finfo(b.dtype).eps)) ** 2 * rz)
     done, decrease = 0, 0.0
     while done < max_iterations and rz > enough:
         if should_stop is not None and should_stop():
@@ -78,7 +76,7 @@ def conjugate_gradient(
         before, rz = rz, dot(residual, z)
         _turn(rz / before, z, direction)
         done += 1
-    return Solved(x, done, float(np.sqrt(max(rz, 0.0) / first)) if first > 0 else 0.0, decrease)
+    return Solved(x, done, decrease)
 
 
 def _advance(step: float, direction: Array, image: Array, *, x: Array, residual: Array) -> None:
