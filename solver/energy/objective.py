@@ -59,8 +59,7 @@ def weights_of(problem: Problem, residual: Array, frame: int) -> Array:
 
 def prior(problem: Problem, shapes: Array) -> float:
     """Return the terms of the energy that do not depend on the tracks."""
-    weights = problem.weights
-    return smoothness(problem, shapes) + rank_penalty(shapes, weights.low_rank, weights.rank_floor)
+    return smoothness(problem, shapes) + rank_penalty(shapes, problem.weights.low_rank)
 
 
 def smoothness(problem: Problem, shapes: Array) -> float:

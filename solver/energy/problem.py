@@ -27,8 +27,6 @@ class Weights:
     """ε of the smoothed L1 or δ of Huber."""
     order: int
     """Order of H."""
-    rank_floor: float = 0.0
-    """δ of the low-rank prior: variance per point below which a mode counts as noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -165,14 +165,13 @@ def _evaluated(
             np.einsum("cp,cp->p", left, left, out=squared[frame])
 
     over_ranges(work, frames, smallest=max(1, SMALLEST // shapes[0].size))
-    weights = problem.weights
     value = float(losses.sum())
     value = value + prior(problem, shapes) if np.isfinite(value) else value
     if not np.isfinite(value):
         raise NotFinite(f"the energy became {value} after {reweighting} reweightings")
     seen = problem.confidence > 0
     return State(
-        shapes=shapes, translations=translations, omega=fresh, rank=rank_term(shapes, weights.low_rank, weights.rank_floor),
+        shapes=shapes, translations=translations, omega=fresh, rank=rank_term(shapes, problem.weights.low_rank),
         objective=value, residual=float(np.sqrt(np.median(squared if seen.all() else squared[seen]))),
         reweighting=reweighting, iterations=0, reduction=INNER_REDUCTION,
     )  # fmt: skip

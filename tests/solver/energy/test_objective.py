@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pliant.solver import Mesh
+from pliant.solver.energy import low_rank
 from pliant.solver.energy.objective import objective, residuals
 from pliant.solver.energy.problem import Problem
 from pliant.solver.linear import block_tridiagonal
@@ -61,23 +62,28 @@ def dense_energy(problem: Problem, shapes: np.ndarray, translations: np.ndarray)
         total += (
             w.low_rank
             * count
-            * sum(g / w.rank_floor if g < w.rank_floor else 1 + np.log(g / w.rank_floor) for g in values)
+            * sum(
+                g / low_rank.RANK_FLOOR if g < low_rank.RANK_FLOOR else 1 + np.log(g / low_rank.RANK_FLOOR)
+                for g in values
+            )
         )
     return total
 
 
 @pytest.mark.parametrize("loss", ["l1", "l2", "huber"])
 @pytest.mark.parametrize("mesh", MESHES)
-def test_energy_is_equation_7_summed_one_by_one(mesh: str, loss: str) -> None:
-    problem = with_weights(small_problem(MESHES[mesh], loss=loss, temporal_order=2), low_rank=0.01, rank_floor=0.4)
+def test_energy_is_equation_7_summed_one_by_one(monkeypatch: pytest.MonkeyPatch, mesh: str, loss: str) -> None:
+    monkeypatch.setattr(low_rank, "RANK_FLOOR", 0.4)
+    problem = with_weights(small_problem(MESHES[mesh], loss=loss, temporal_order=2), low_rank=0.01)
     state = started(problem)
     np.testing.assert_allclose(state.objective, dense_energy(problem, state.shapes, state.translations), rtol=1e-12)
 
 
 @pytest.mark.parametrize("loss", ["l1", "l2", "huber"])
 @pytest.mark.parametrize("mesh", MESHES)
-def test_normal_equations_give_the_gradient(mesh: str, loss: str) -> None:
-    problem = with_weights(small_problem(MESHES[mesh], loss=loss), low_rank=0.01, rank_floor=0.4)
+def test_normal_equations_give_the_gradient(monkeypatch: pytest.MonkeyPatch, mesh: str, loss: str) -> None:
+    monkeypatch.setattr(low_rank, "RANK_FLOOR", 0.4)
+    problem = with_weights(small_problem(MESHES[mesh], loss=loss), low_rank=0.01)
     state = started(problem)
     operator = operator_at(problem, state)
     target = problem.points - state.translations[:, :, None]
@@ -94,8 +100,11 @@ def test_normal_equations_give_the_gradient(mesh: str, loss: str) -> None:
 
 @pytest.mark.parametrize("loss", ["l1", "l2", "huber"])
 @pytest.mark.parametrize("mesh", MESHES)
-def test_energy_never_rises_and_ends_where_the_gradient_vanishes(mesh: str, loss: str) -> None:
-    problem = with_weights(small_problem(MESHES[mesh], loss=loss), low_rank=0.01, rank_floor=0.05)
+def test_energy_never_rises_and_ends_where_the_gradient_vanishes(
+    monkeypatch: pytest.MonkeyPatch, mesh: str, loss: str
+) -> None:
+    monkeypatch.setattr(low_rank, "RANK_FLOOR", 0.05)
+    problem = with_weights(small_problem(MESHES[mesh], loss=loss), low_rank=0.01)
     state = started(problem)
     first = gradient_norm(problem, state)
     for _ in range(60):
