@@ -27,7 +27,7 @@ def build(operator: Operator, stiffness: Floats | None = None) -> Linear:
     """
     stiffness = block_tridiagonal.stiffness_of_neighbours(operator) if stiffness is None else stiffness
     paths = block_tridiagonal.build(operator, stiffness)
-    if operator.quadratic is None or operator.stencil[0].max() == 0:
+    if operator.quadratic is None:
         return paths
     modes, coarse = MeanModes.of(operator, float(stiffness.mean())), build_coarse(operator, stiffness)
 

@@ -55,12 +55,6 @@ class PathPrior:
         first, second, third = (each.astype(kind) for each in self.modes)
         return PathPrior(self.bands, (first, second, third))
 
-    def matrices(self) -> Floats:
-        """Return all Q_c as dense matrices, shape `(3, F, F)`."""
-        frames = self.bands.shape[1]
-        chain = _chained(self.bands, np.eye(frames))
-        return np.stack([chain - each.astype(np.float64) @ each.T.astype(np.float64) for each in self.modes])
-
     def subtract_modes(self, shapes: Array, result: Array) -> None:
         """Subtract V_c V_cᵀ X_c from each coordinate c of the result; the operator's stencil applies B."""
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from learning import learn
+from learning import dense_precisions, learn
 from pliant.solver import KnownCamera, Settings, gallery, solve
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.evaluation import metrics
@@ -117,7 +117,7 @@ def test_precisions_are_the_inverse_of_the_covariance() -> None:
     )
     inverse = np.zeros((FRAMES, 3, FRAMES, 3))
     for axis in range(3):
-        inverse[:, axis, :, axis] = precisions.matrices()[axis]
+        inverse[:, axis, :, axis] = dense_precisions(precisions)[axis]
     back = np.kron(np.eye(FRAMES), np.linalg.inv(basis))
     np.testing.assert_allclose(
         back.T @ inverse.reshape(3 * FRAMES, -1) @ back, np.linalg.inv(whole), rtol=1e-6, atol=1e-4
