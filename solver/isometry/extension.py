@@ -19,9 +19,9 @@ from scipy import sparse
 from scipy.sparse.csgraph import shortest_path
 
 MIN_ANCHORS, MIN_WIDTH = 6, 0.3
-"""Minimum number of visible anchors for a frame to be used, and minimum standard deviation of their template positions in the direction in
-which they extend least, relative to the template's: anchors on a line do not determine the pose of the surface. A rolled sheet of 7 × 7
-points, one frame of which shows one or two rows: the error of that frame is .06, and .26 to .64 with any width."""
+"""Minimum number of anchors, in total and visible in a frame to use it, and minimum standard deviation of their template positions in
+the direction in which they extend least, relative to the template's: anchors on a line do not determine the pose of the surface. A rolled
+sheet of 7 × 7 points, one frame of which shows one or two rows: the error of that frame is .06, and .26 to .64 with any width."""
 
 STIFF = 1e-3
 """Smoothing of the splines, in units of the template's squared standard deviation; needed because the anchors' depths are not exact."""

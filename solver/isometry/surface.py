@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.anchors import choose_anchors, connected, nearest_neighbours, unlike_frames
 from pliant.solver.isometry.confirmation import DECISIVE, DISAGREEMENT, deformation, disagreement
-from pliant.solver.isometry.extension import Extended, complete_anchors, extend, flatten
+from pliant.solver.isometry.extension import MIN_ANCHORS, Extended, complete_anchors, extend, flatten
 from pliant.solver.isometry.focal_sweep import CLEAR, FocalSearch, Judgement, Tried, judged, least_of, sweep
 from pliant.solver.isometry.homographies import off_homography
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
@@ -56,9 +56,6 @@ FIRST_LOOK = 200
 """Approximate number of points used to choose dissimilar frames and to measure deformation."""
 
 TOO_LITTLE = "Too few points are visible in the same frames for an isometric surface."
-
-FEWEST_ANCHORS = 6
-"""Minimum number of anchors of a surface, in total and per frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -252,17 +249,17 @@ def _some_frames(points: Floats, seen: NDArray[np.bool_]) -> NDArray[np.intp]:
 def _prepared(
     points: Floats, seen: NDArray[np.bool_], centre: Floats, should_stop: Callable[[], bool] | None
 ) -> FocalSearch | None:
-    if (seen.sum(axis=0) >= 2).sum() < FEWEST_ANCHORS:
+    if (seen.sum(axis=0) >= 2).sum() < MIN_ANCHORS:
         return None
     anchors = choose_anchors(points, seen, ANCHORS)
-    if anchors.points.shape[1] < FEWEST_ANCHORS:
+    if anchors.points.shape[1] < MIN_ANCHORS:
         return None
     edges = nearest_neighbours(anchors)
     if len(edges) == 0:
         return None
     known = connected(anchors.seen, edges)
     # Fewer anchors do not determine their depths, which would distort the lengths of all frames.
-    known &= known.sum(axis=1, keepdims=True) >= FEWEST_ANCHORS
+    known &= known.sum(axis=1, keepdims=True) >= MIN_ANCHORS
     if known.any(axis=1).sum() < 2:
         return None
     frames = unlike_frames(anchors.points, known, SOLVED_FRAMES)

@@ -19,6 +19,7 @@ from pliant.solver.model.so3 import MIRROR, nearest
 from pliant.solver.records import Floats
 from pliant.solver.refinement.focal_length import refine_with_focal
 from pliant.solver.refinement.learned import Learned, Refinement
+from pliant.solver.refinement.starts import START_FRAMES
 from pliant.solver.tracks.frame_selection import evenly_spread
 from pliant.solver.tracks.matrix import centred, columns
 
@@ -27,9 +28,6 @@ ALTERNATION_ROUNDS = 3
 
 ALTERNATION_EM_ROUNDS = 60
 """EM rounds per update."""
-
-COMPARED_FRAMES = 40
-"""Frames on which the cameras of factorizations are compared, as in `starts.START_FRAMES`."""
 
 
 def alternate(
@@ -90,7 +88,7 @@ def refactorize(
     how : Refinement
         What the comparison refines; must turn.
     """
-    places = evenly_spread(len(used), COMPARED_FRAMES)
+    places = evenly_spread(len(used), START_FRAMES)
     some = used[places]
     part = replace(
         found, rotations=found.rotations[places], scales=found.scales[places], energy=np.inf,

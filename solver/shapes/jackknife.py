@@ -31,7 +31,7 @@ from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.observation_model import ImageDensity
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.records import Floats
+from pliant.solver.records import MIN_POINTS, Floats
 from pliant.solver.refinement.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.shapes.uncertainty import distant_paths
 from pliant.solver.tracks.frame_selection import between, evenly_spread
@@ -47,9 +47,6 @@ MAX_JACKKNIFE_FRAMES = 100
 LEARNING_ROUNDS, TURNING_ITERATIONS = 20, 60
 """Iterations of expectation maximisation and of L-BFGS in each refinement. Ending before the minimum understates the change: with 5 and 15,
 the estimated error of the dance sequence is .128, with 40 and 120 it is .169."""
-
-MIN_LEARNED_POINTS = 4
-"""Minimum number of points to learn from."""
 
 CLUSTERING = 5
 """Iterations of k-means for the parts."""
@@ -124,7 +121,7 @@ def learning_changes(
         np.inf,
     )
     sample = _Sample(centred(np.asarray(estimate.sample)[used]), observed[used])
-    if sample.points.shape[1] <= MIN_LEARNED_POINTS:
+    if sample.points.shape[1] <= MIN_POINTS:
         return nothing
     every, without = np.ones(sample.points.shape[1], dtype=bool), []
     try:
@@ -135,7 +132,7 @@ def learning_changes(
         for part in np.unique(part_of):
             if should_stop is not None and should_stop():
                 return nothing
-            if (part_of != part).sum() >= MIN_LEARNED_POINTS:
+            if (part_of != part).sum() >= MIN_POINTS:
                 without.append(_onto(_shapes_from(sample, part_of != part, start, early, turning), everything))
     except np.linalg.LinAlgError:  # depth is unbounded
         return replace(nothing, bounded=False)

@@ -13,8 +13,8 @@ from pliant.solver.model.early_stopping import learn_with_early_stopping
 from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.records import Floats
-from pliant.solver.shapes.jackknife import MIN_LEARNED_POINTS, PARTS, learning_changes, parts
+from pliant.solver.records import MIN_POINTS, Floats
+from pliant.solver.shapes.jackknife import PARTS, learning_changes, parts
 from pliant.solver.tracks.matrix import centred, columns
 from scipy.spatial.transform import Rotation
 
@@ -120,7 +120,7 @@ def test_learning_std_is_interpolated_between_evaluated_frames(monkeypatch: pyte
 
 def test_too_few_points_or_a_stop_give_zero() -> None:
     estimate, covariance, shapes = seen(20)
-    few = replace(estimate, sample=estimate.sample[:, :MIN_LEARNED_POINTS])
+    few = replace(estimate, sample=estimate.sample[:, :MIN_POINTS])
     assert (learning_std(few, covariance, shapes, turning=True) == 0).all()
     assert (learning_std(estimate, covariance, shapes, turning=True, should_stop=lambda: True) == 0).all()
 
