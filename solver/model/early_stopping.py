@@ -19,11 +19,12 @@ from pliant.solver.model.expectation_maximisation import (
     ANNEALING_START,
     MAX_MODES,
     WALK_VARIANCE_FLOOR,
+    ModelOrder,
     learned,
     rounds,
     scratch,
 )
-from pliant.solver.model.model_order import MIN_JUDGED_POINTS, MIN_NLL_GAIN, ModelOrder, held_out_nll
+from pliant.solver.model.model_order import MIN_JUDGED_POINTS, MIN_NLL_GAIN, held_out_nll
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import MAX_SAMPLE_POINTS
@@ -90,14 +91,7 @@ def learn_with_early_stopping(
         covariance = early.learned(gram, projections)
         reason = f"learned in {len(early.floors)} rounds; more would make held-out points less probable."
         return covariance, described(covariance, reason)
-    covariance = learned(
-        gram,
-        projections,
-        max_modes=model_order.max_modes,
-        noisy_start=model_order.noisy_start,
-        ordered=model_order.ordered,
-        should_stop=should_stop,
-    )
+    covariance = learned(gram, projections, model_order, should_stop=should_stop)
     reason = (
         f"more than {model_order.max_modes} modes, learned from some points, do not make other points more probable."
     )
@@ -157,9 +151,7 @@ def _judged(
 
 def _rounds(gram: Floats, projections: Floats, model_order: ModelOrder, floors: Floats) -> Iterator[ShapeCovariance]:
     """Yield the covariance after every round from scratch."""
-    start = scratch(
-        gram, projections, model_order.max_modes, noisy_start=model_order.noisy_start, ordered=model_order.ordered
-    )
+    start = scratch(gram, projections, model_order)
     return rounds(start, gram, projections, floors=floors, max_modes=model_order.max_modes)
 
 

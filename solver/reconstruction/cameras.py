@@ -11,7 +11,7 @@ from pliant.solver.cameras import estimation
 from pliant.solver.cameras.estimation import CameraEstimate, given_cameras
 from pliant.solver.cameras.planar_ambiguity import is_planar
 from pliant.solver.limits import LEARNED_FRAMES, learned_stride
-from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.model.expectation_maximisation import ModelOrder
 from pliant.solver.monitor import Monitor, enter
 from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.long_films import extended

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import Perspective, corrected, depth_map
-from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.model.expectation_maximisation import ModelOrder
 from pliant.solver.model.resection import MeanShapes, Poses, Views, interpolated, predicted, resected
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import angles_between, start_at_identity

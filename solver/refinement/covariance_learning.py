@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.model.early_stopping import described, learn_with_early_stopping
-from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.model.expectation_maximisation import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import mirrored
 from pliant.solver.model import full_mode_covariance
-from pliant.solver.model.expectation_maximisation import MAX_MODES
-from pliant.solver.model.model_order import ModelOrder, select_model_order
+from pliant.solver.model.expectation_maximisation import MAX_MODES, ModelOrder
+from pliant.solver.model.model_order import select_model_order
 from pliant.solver.model.resection import rotations_between
 from pliant.solver.model.so3 import MIRROR, angles_between
 from pliant.solver.monitor import enter

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.model.expectation_maximisation import annealed, learned
+from pliant.solver.model.expectation_maximisation import ModelOrder, annealed, learned
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, fit, metric_of, root_of
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import AXIS_VARIANCE_FLOOR, NOISE_VARIANCE_FLOOR, ShapeCovariance
 from pliant.solver.model.so3 import exponential, logarithm
 from pliant.solver.records import Floats
@@ -86,7 +85,7 @@ class Refinement:
             Maximum number of EM rounds.
         """
         covariance = learned(
-            gram, rotations[:, :2] * scales[:, None, None], iterations=iterations, **asdict(self.model_order), should_stop=self.should_stop
+            gram, rotations[:, :2] * scales[:, None, None], self.model_order, iterations=iterations, should_stop=self.should_stop
         )  # fmt: skip
         return Learned(rotations, scales, covariance, np.inf)
 
@@ -94,7 +93,7 @@ class Refinement:
         """Return what `learn` returns by annealing alone, without stops, from orthographic tracks `(F, S, 2)`."""
         rows = columns(centred(images))
         covariance = annealed(
-            rows @ rows.T / rows.shape[1], rotations[:, :2] * scales[:, None, None], iterations=iterations, **asdict(self.model_order)
+            rows @ rows.T / rows.shape[1], rotations[:, :2] * scales[:, None, None], self.model_order, iterations=iterations
         )  # fmt: skip
         return Learned(rotations, scales, covariance, np.inf)
 

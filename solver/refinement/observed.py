@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import Perspective, corrected, depth_map
-from pliant.solver.model.expectation_maximisation import learned
+from pliant.solver.model.expectation_maximisation import ModelOrder, learned
 from pliant.solver.model.observation_model import ImageDensity, inlier_probabilities
 from pliant.solver.records import Floats
 from pliant.solver.refinement.learned import START_EM_ROUNDS, Learned, Refinement
@@ -117,8 +117,12 @@ def cross_fitted(
         others, own = estimate.sample[used][:, part != fold], part == fold
         rows = columns(others)
         covariance = learned(
-            rows @ rows.T / rows.shape[1], projections, iterations=START_EM_ROUNDS, ordered=estimate.ordered, should_stop=should_stop
-        )  # fmt: skip
+            rows @ rows.T / rows.shape[1],
+            projections,
+            ModelOrder(ordered=estimate.ordered),
+            iterations=START_EM_ROUNDS,
+            should_stop=should_stop,
+        )
         image, weight, share = covariance.of_image(projections), observed.weight[:, own], estimate.outliers
         for _ in range(2):  # the second pass rejects the outliers of the first
             found[:, own], share = inlier_probabilities(

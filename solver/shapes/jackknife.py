@@ -26,9 +26,8 @@ from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import depth_map
 from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.model.early_stopping import Schedule, schedule
-from pliant.solver.model.expectation_maximisation import improve
+from pliant.solver.model.expectation_maximisation import ModelOrder, improve
 from pliant.solver.model.marginal_likelihood import fit
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.observation_model import ImageDensity
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import MIN_POINTS, Floats

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pliant.solver.model import early_stopping
 from pliant.solver.model.early_stopping import learn_with_early_stopping
-from pliant.solver.model.expectation_maximisation import learned
-from pliant.solver.model.model_order import MIN_JUDGED_POINTS, ModelOrder, held_out_nll
+from pliant.solver.model.expectation_maximisation import ModelOrder, learned
+from pliant.solver.model.model_order import MIN_JUDGED_POINTS, held_out_nll
 from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
@@ -41,7 +41,7 @@ def gram_of(images: np.ndarray) -> np.ndarray:
 def both(images: np.ndarray) -> tuple[ShapeCovariance, ShapeCovariance, str]:
     """The covariance with early stopping, the fully learned one, and the reason."""
     found, why = learn_with_early_stopping(images, gram_of(images), PAIRS, ModelOrder())
-    return found, learned(gram_of(images), PAIRS), why
+    return found, learned(gram_of(images), PAIRS, ModelOrder()), why
 
 
 def test_early_stopping_avoids_overfitting_the_given_points() -> None:

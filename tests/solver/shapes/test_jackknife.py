@@ -10,8 +10,7 @@ import pytest
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import depth_map
 from pliant.solver.model.early_stopping import learn_with_early_stopping
-from pliant.solver.model.expectation_maximisation import annealed
-from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.model.expectation_maximisation import ModelOrder, annealed
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import MIN_POINTS, Floats
 from pliant.solver.shapes.jackknife import PARTS, learning_changes, parts
@@ -34,7 +33,7 @@ def seen(
     sample = np.einsum("fij,fpj->fpi", rotations[:, :2], shapes) + noise * rng.normal(size=(FRAMES, points, 2))
     rows = columns(centred(sample))
     gram = rows @ rows.T / points
-    covariance = annealed(gram, rotations[:, :2], iterations=40)
+    covariance = annealed(gram, rotations[:, :2], ModelOrder(), iterations=40)
     estimate = CameraEstimate(rotations, np.ones(FRAMES), np.zeros((FRAMES, 2)), 0, gram, sample)
     return estimate, covariance, shapes
 
