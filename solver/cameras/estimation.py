@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,6 +21,7 @@ from pliant.solver.cameras.planar_ambiguity import is_planar, resolve_pose_signs
 from pliant.solver.cameras.scale import rigid_evidence, rigid_scales
 from pliant.solver.model.so3 import angles_between, start_at_identity
 from pliant.solver.monitor import enter
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, KnownCamera, read_only
 from pliant.solver.settings import Settings
 from pliant.solver.tracks.completion import Completed, Filling, complete
@@ -118,7 +118,7 @@ def estimate_cameras(
     normalized: Normalized,
     settings: Settings,
     *,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
     rank: int = 0,
 ) -> CameraEstimate:
     """Estimate the cameras from the tracks, without a model of the shapes.
@@ -177,7 +177,7 @@ def _factorized(
     sizes: list[int],
     *,
     ordered: bool,
-    should_stop: Callable[[], bool] | None,
+    should_stop: ShouldStop,
 ) -> tuple[list[Upgrade], list[Candidate]]:
     """Return the factorization for every K of `sizes`, and from each a multistart candidate at the frames used."""
     factorized: list[Upgrade] = []
@@ -194,7 +194,7 @@ def _factorized(
                 should_stop=should_stop,
             )
         )
-        if should_stop is not None and should_stop():
+        if should_stop():
             break
     return factorized, entries
 
@@ -249,7 +249,7 @@ def given_cameras(
     *,
     rank: int = 0,
     perspective: bool = False,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> CameraEstimate:
     """Return given cameras as an estimate; missing scales are estimated if the camera model has them.
 

@@ -11,13 +11,13 @@ Long sequences use every n-th frame; the correction found is interpolated to the
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, Motion, Scene, cameras_of, fit, start
 from pliant.solver.model.so3 import exponential, logarithm, nearest
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.tracks.frame_selection import between
 from pliant.solver.tracks.noise import white_noise
@@ -79,7 +79,7 @@ def with_fixed_rotations(
     *,
     smooth_start: bool,
     ordered: bool,
-    should_stop: Callable[[], bool] | None,
+    should_stop: ShouldStop,
 ) -> Candidate:
     """Return cameras, such as those of a factorization, and their energy with the rotations fixed and every scale 1."""
     scene = Scene.of(gram, rotations, with_scales=False, prior_weight=scaled_prior_weight(gram), ordered=ordered)
@@ -94,7 +94,7 @@ def with_fixed_rotations(
 
 
 def run_multistart(
-    gram: Floats, entries: list[Candidate], *, ordered: bool = True, should_stop: Callable[[], bool] | None = None
+    gram: Floats, entries: list[Candidate], *, ordered: bool = True, should_stop: ShouldStop = never
 ) -> tuple[Candidate, list[Candidate]]:
     """Return the best candidate, refined, and all candidates after the first round.
 
@@ -119,14 +119,14 @@ def run_multistart(
     for iterations, left in MULTISTART_ROUNDS:
         finished: list[Candidate] = []
         for candidate in running:
-            stopped = should_stop is not None and should_stop()
+            stopped = should_stop()
             finished.append(candidate if stopped else refined(candidate, iterations, should_stop=should_stop))
         first = first or finished
         running = sorted(finished, key=rating)[:left]
     return running[0], first
 
 
-def refined(candidate: Candidate, iterations: int, *, should_stop: Callable[[], bool] | None = None) -> Candidate:
+def refined(candidate: Candidate, iterations: int, *, should_stop: ShouldStop = never) -> Candidate:
     """Return the candidate after `iterations` L-BFGS iterations with free rotations."""
     motion, energy = fit(
         candidate.scene, candidate.motion, iterations=iterations, turning=True, should_stop=should_stop
@@ -134,7 +134,7 @@ def refined(candidate: Candidate, iterations: int, *, should_stop: Callable[[], 
     return Candidate(candidate.basis_size, candidate.smooth_start, candidate.scene, motion, energy)
 
 
-def smooth_start(gram: Floats, candidate: Candidate, *, should_stop: Callable[[], bool] | None = None) -> Candidate:
+def smooth_start(gram: Floats, candidate: Candidate, *, should_stop: ShouldStop = never) -> Candidate:
     """Return a candidate with smooth camera motion near the given one.
 
     The factorization of a body that deforms as fast as it rotates gives jittering cameras near a local minimum of the

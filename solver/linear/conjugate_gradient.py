@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.pulse import pulse
+from pliant.solver.pulse import ShouldStop, never, pulse
 from pliant.solver.threads import SMALLEST, over_ranges
 
 Array = NDArray[np.floating]
@@ -39,7 +39,7 @@ def conjugate_gradient(
     reduction: float,
     max_iterations: int,
     negligible: float = 0.0,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> Solved:
     """Solve 𝒜 x = b, starting from 0, for a symmetric positive (semi)definite 𝒜; b is overwritten.
 
@@ -54,8 +54,7 @@ def conjugate_gradient(
     residual share an array, as they are never needed at the same time.
     """
     x, residual, spare = np.zeros_like(b), b, np.empty_like(b)
-    if should_stop is not None:
-        should_stop()  # to report progress: first touching gigabytes of memory takes as long as an iteration
+    should_stop()  # to report progress: first touching gigabytes of memory takes as long as an iteration
     z = precondition(residual, out=spare)
     pulse()
     direction = np.empty_like(b)
@@ -64,7 +63,7 @@ def conjugate_gradient(
     enough = max(negligible, max(reduction, 10 * float(np.finfo(b.dtype).eps)) ** 2 * rz)
     done, decrease = 0, 0.0
     while done < max_iterations and rz > enough:
-        if should_stop is not None and should_stop():
+        if should_stop():
             break
         image = apply(direction, out=spare)
         curvature = dot(direction, image)

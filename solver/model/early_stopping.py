@@ -11,7 +11,7 @@ If the motion has few modes, the held-out likelihood improves to the end and EM 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +26,7 @@ from pliant.solver.model.expectation_maximisation import (
 )
 from pliant.solver.model.model_order import MIN_JUDGED_POINTS, MIN_NLL_GAIN, held_out_nll
 from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import MAX_SAMPLE_POINTS
 from pliant.solver.tracks.matrix import columns
@@ -67,7 +68,7 @@ def learn_with_early_stopping(
     model_order: ModelOrder,
     *,
     seed: int = 0,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> tuple[ShapeCovariance, str]:
     """Return the covariance learned from scratch in the number of rounds that held-out points favour, and a sentence.
 
@@ -104,7 +105,7 @@ def schedule(
     model_order: ModelOrder,
     *,
     seed: int = 0,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> Schedule | None:
     """Return the rounds that held-out points favour; None where they favour all rounds. Arguments as for `learn_with_early_stopping`."""
     frames, count = sample.shape[:2]
@@ -130,9 +131,7 @@ def described(covariance: ShapeCovariance, more: str = "") -> str:
     return f"{found}; {more}" if more else f"{found}."
 
 
-def _judged(
-    points: Floats, projections: Floats, way: Schedule, seed: int, should_stop: Callable[[], bool] | None
-) -> list[float]:
+def _judged(points: Floats, projections: Floats, way: Schedule, seed: int, should_stop: ShouldStop) -> list[float]:
     """Return the mean held-out negative log likelihood after every round, until it has risen by `MAX_NLL_RISE`."""
     part = np.random.default_rng(seed).permutation(points.shape[1]) % FOLDS
     paths, others = [], []
@@ -144,7 +143,7 @@ def _judged(
     for covariances in zip(*paths, strict=True):
         energies = [held_out_nll(each, projections, other) for each, other in zip(covariances, others, strict=True)]
         found.append(sum(energies) / FOLDS)
-        if found[-1] > min(found) + MAX_NLL_RISE or (should_stop is not None and should_stop()):
+        if found[-1] > min(found) + MAX_NLL_RISE or should_stop():
             break
     return found
 

@@ -16,6 +16,7 @@ from pliant.solver.model.marginal_likelihood import root_matrix
 from pliant.solver.model.random_walk import WalkPosterior, coloured, walk_bands, whitened, whitener
 from pliant.solver.model.shape_covariance import AXIS_VARIANCE_FLOOR, NOISE_VARIANCE_FLOOR, ShapeCovariance
 from pliant.solver.model.so3 import IDENTITY
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.tracks.noise import roughness
 from scipy.linalg import lapack
@@ -75,7 +76,7 @@ def learned(
     model_order: ModelOrder,
     *,
     iterations: int = MAX_ITERATIONS,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> ShapeCovariance:
     """Return the more probable of two covariances learned by EM from scratch.
 
@@ -113,7 +114,7 @@ def annealed(
     model_order: ModelOrder,
     *,
     iterations: int,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> ShapeCovariance:
     """Return the covariance after `iterations` annealed rounds from scratch."""
     return improve(
@@ -167,7 +168,7 @@ def improve(
     iterations: int,
     warm: float = WALK_VARIANCE_FLOOR,
     max_modes: int = MAX_MODES,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> ShapeCovariance:
     """Return the covariance after rounds of EM with a floor of τ that falls from `warm` to `WALK_VARIANCE_FLOOR`.
 
@@ -176,7 +177,7 @@ def improve(
     floors = np.geomspace(warm, WALK_VARIANCE_FLOOR, iterations)
     for better in rounds(covariance, gram, projections, floors=floors, max_modes=max_modes):
         covariance = better
-        if should_stop is not None and should_stop():
+        if should_stop():
             break
     return covariance
 

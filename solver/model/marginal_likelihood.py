@@ -28,6 +28,7 @@ from pliant.solver.model.camera_motion_prior import STEADY, rotation_roughness, 
 from pliant.solver.model.frame_metric import FrameMetric
 from pliant.solver.model.image_density import ImageModel, Terms, factor_of, inverted, terms
 from pliant.solver.model.so3 import exponential_and_jacobian, vee
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from scipy.optimize import minimize
 
@@ -273,7 +274,7 @@ def fit(
     iterations: int,
     turning: bool,
     metric: FrameMetric | None = None,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> tuple[Motion, float]:
     """Return the parameters that minimise the energy, by L-BFGS from `motion`, and the energy reached.
 
@@ -297,7 +298,7 @@ def fit(
         return factor * value, factor * slope[held:]
 
     def stop_check(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
-        if should_stop is not None and should_stop():
+        if should_stop():
             raise StopIteration
 
     found = minimize(

@@ -10,7 +10,6 @@ Without noise, additional modes do no harm and keep deformation out of the camer
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +17,7 @@ from pliant.solver.model.expectation_maximisation import MAX_MODES, ModelOrder, 
 from pliant.solver.model.image_density import negative_log_likelihoods
 from pliant.solver.model.marginal_likelihood import NOISE_STD_FLOOR
 from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import ranks
 from pliant.solver.tracks.frame_selection import evenly_spread
@@ -46,7 +46,7 @@ def select_model_order(
     *,
     ordered: bool = True,
     seed: int = 0,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> ModelOrder:
     """Return the order that the sample supports: no limit where there is no noise.
 
@@ -94,7 +94,7 @@ def _judged(
     projections: Floats,
     model_order: ModelOrder,
     *,
-    should_stop: Callable[[], bool] | None,
+    should_stop: ShouldStop,
 ) -> Floats:
     """Return the held-out negative log likelihood for each number of modes; `model_order` determines the start."""
     frames = len(projections)
@@ -102,7 +102,7 @@ def _judged(
     counts = _counts(frames)
     energies = np.full(len(counts), np.inf)
     for index, max_modes in enumerate(counts):
-        if index and should_stop is not None and should_stop():
+        if index and should_stop():
             break
         limited = replace(model_order, max_modes=max_modes)
         found = annealed(gram, projections, limited, iterations=JUDGED_ITERATIONS, should_stop=should_stop)

@@ -13,7 +13,6 @@ Levenberg–Marquardt on SO(3) (Hartley and Zisserman, Multiple View Geometry, 2
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -22,6 +21,7 @@ from pliant.solver.model.image_density import Explained
 from pliant.solver.model.marginal_likelihood import root_matrix
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential, from_rows, logarithm
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.threads import over_ranges
 from pliant.solver.tracks.matrix import columns
@@ -177,7 +177,7 @@ def resected(
     *,
     turning: bool,
     with_scales: bool,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> Poses:
     """Return the most probable pose of every frame.
 
@@ -200,7 +200,7 @@ def resected(
     group = 2 * FRAMES_TOGETHER
     for low in range(0, len(views.points), 8 * group):
         block = slice(low, min(low + 8 * group, len(views.points)))
-        if should_stop is not None and should_stop():
+        if should_stop():
             done.append(start.part(slice(low, None)))
             break
         done.append(_resected(views.part(block), shapes, start.part(block), turning, with_scales))

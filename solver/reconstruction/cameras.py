@@ -13,9 +13,9 @@ from pliant.solver.cameras.planar_ambiguity import is_planar
 from pliant.solver.limits import LEARNED_FRAMES, learned_stride
 from pliant.solver.model.expectation_maximisation import ModelOrder
 from pliant.solver.monitor import Monitor, enter
-from pliant.solver.pulse import pulses_to
+from pliant.solver.pulse import ShouldStop, pulses_to
 from pliant.solver.reconstruction.long_films import extended
-from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, monitored, observe
+from pliant.solver.reconstruction.observations import Observations, OnStep, monitored, observe
 from pliant.solver.records import MIN_POINTS, Camera, Floats, KnownCamera, Step, Tracks
 from pliant.solver.refinement.covariance_learning import LearningData, learn_covariance
 from pliant.solver.refinement.depth_rounds import correct_perspective

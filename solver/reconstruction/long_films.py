@@ -8,7 +8,6 @@ a factor of their Gram matrix, which is never formed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +19,7 @@ from pliant.solver.model.resection import MeanShapes, Poses, Views, interpolated
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import angles_between, start_at_identity
 from pliant.solver.monitor import enter
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.reconstruction.observations import Observations
 from pliant.solver.records import Floats, read_only
 from pliant.solver.refinement.covariance_learning import LearningData
@@ -37,7 +37,7 @@ def extended(
     used: NDArray[np.intp],
     observations: Observations,
     *,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> tuple[CameraEstimate, LearningData]:
     """Return cameras and covariance of all frames of a film.
 

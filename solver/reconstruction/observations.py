@@ -12,13 +12,13 @@ from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.errors import InvalidInput
 from pliant.solver.limits import frame_chunks
 from pliant.solver.monitor import Monitor
+from pliant.solver.pulse import ShouldStop
 from pliant.solver.records import Floats, KnownCamera, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.stages import planned, unseen_frames
 from pliant.solver.tracks.normalization import Normalized, normalize, relative
 
 OnStep = Callable[[Step], None]
-ShouldStop = Callable[[], bool]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,9 +14,9 @@ from pliant.solver.errors import InvalidInput, InvalidSettings
 from pliant.solver.mesh import Mesh
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor
-from pliant.solver.pulse import pulses_to
+from pliant.solver.pulse import ShouldStop, pulses_to
 from pliant.solver.reconstruction.cameras import Cameras
-from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, monitored
+from pliant.solver.reconstruction.observations import Observations, OnStep, monitored
 from pliant.solver.reconstruction.prior import Prior, estimate_with
 from pliant.solver.records import Choices, Floats, Step, Tracks
 from pliant.solver.settings import Settings
@@ -145,7 +145,7 @@ def prepared(
     *,
     moving: bool,
     bending: float | None = None,
-    should_stop: ShouldStop | None = None,
+    should_stop: ShouldStop,
 ) -> Start:
     """Return the start of the minimisation, before outlier rejection; less converged once `should_stop` returns True.
 
@@ -167,17 +167,16 @@ def prepared(
         _check_prior(prior, tracks, settings)
         estimate, covariance = estimate_with(cameras, prior), prior.normalized
     flat = orthographic(observations.normalized, estimate.perspective)
-    tick = should_stop if should_stop is not None else bool
-    tick()
+    should_stop()
     part = None if covariance is None or settings.temporal_weight == 0 else well_observed(flat, mesh)
     if part is None:
         problem, choices = build_problem(flat, estimate, mesh, settings, covariance)
     else:
         problem, choices = build_problem(part.normalized, estimate, part.mesh, settings, covariance)
     problem = replace(problem, moving=moving)
-    tick()
+    should_stop()
     state = _initial(problem, estimate, settings, should_stop)
-    tick()
+    should_stop()
     return Start(
         observations, mesh, settings, flat, estimate, covariance, cameras.outliers, part,
         *with_bending(problem, choices, state, settings, bending=bending),
@@ -200,7 +199,7 @@ def _check_prior(prior: Prior, tracks: Tracks, settings: Settings) -> None:
         )  # fmt: skip
 
 
-def _initial(problem: Problem, estimate: CameraEstimate, settings: Settings, should_stop: ShouldStop | None) -> State:
+def _initial(problem: Problem, estimate: CameraEstimate, settings: Settings, should_stop: ShouldStop) -> State:
     translations = np.array(estimate.translations, dtype=np.float64)
     if settings.method == "pseudo_inverse":
         return init(problem, pseudo_inverse(problem, translations), translations)

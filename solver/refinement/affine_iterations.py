@@ -73,7 +73,7 @@ def affine_iterations(
     first = FIRST_CURVATURE if view.given is None else view.given
     trials: list[_Trial] = []
     for size in SIZES:
-        if how.stopped() or 3 * size > min(2 * len(used), views.shape[1]):
+        if how.should_stop() or 3 * size > min(2 * len(used), views.shape[1]):
             break
         start = part.factorized(size)
         trials += [part.iterated(size, sign * first, start) for sign in view.signs]

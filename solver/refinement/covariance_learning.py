@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +11,7 @@ from pliant.solver.model.early_stopping import described, learn_with_early_stopp
 from pliant.solver.model.expectation_maximisation import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import enter
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.refinement.depth_rounds import with_depth_map
 
@@ -48,7 +48,7 @@ class LearningData:
 
 
 def learn_covariance(
-    estimate: CameraEstimate, data: LearningData, *, seed: int = 0, should_stop: Callable[[], bool] | None = None
+    estimate: CameraEstimate, data: LearningData, *, seed: int = 0, should_stop: ShouldStop = never
 ) -> tuple[CameraEstimate, ShapeCovariance]:
     """Return the shape covariance of all frames for fixed cameras, and the estimate with the depths that follow from it.
 

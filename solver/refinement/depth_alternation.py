@@ -16,6 +16,7 @@ from pliant.solver.cameras.factorization import upgrades
 from pliant.solver.cameras.multistart import CANDIDATES
 from pliant.solver.cameras.perspective import Perspective, corrected, depths_of
 from pliant.solver.model.so3 import MIRROR, nearest
+from pliant.solver.pulse import never
 from pliant.solver.records import Floats
 from pliant.solver.refinement.focal_length import refine_with_focal
 from pliant.solver.refinement.learned import Learned, Refinement
@@ -55,7 +56,7 @@ def alternate(
     """
     views = view.learning_sample[used]
     for _ in range(rounds):
-        if how.stopped():
+        if how.should_stop():
             break
         try:
             found = _relearned(views, view.curvature, found, how)
@@ -96,7 +97,7 @@ def refactorize(
     )  # fmt: skip
 
     def energy(start: Learned) -> float:
-        moved, _ = alternate(view, start, some, replace(how, should_stop=None), rounds=1)
+        moved, _ = alternate(view, start, some, replace(how, should_stop=never), rounds=1)
         return moved.energy
 
     turns = towards(view.learning_sample.mean(axis=1), view.curvature)
@@ -105,7 +106,7 @@ def refactorize(
     limit = min(len(gram) // 3, view.learning_sample.shape[1] // 3)
     best, lowest = None, energy(part)
     for each in upgrades(gram, [size for size in CANDIDATES if size <= limit]):
-        if how.stopped():
+        if how.should_stop():
             break
         rotations = turns.transpose(0, 2, 1) @ aligned(each.rotations, turns[used] @ found.rotations, used)
         reached = energy(replace(part, rotations=rotations[some]))

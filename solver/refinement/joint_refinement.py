@@ -7,7 +7,6 @@ modes, which the random walk replaces); they are refined alternately.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +19,7 @@ from pliant.solver.model.model_order import select_model_order
 from pliant.solver.model.resection import rotations_between
 from pliant.solver.model.so3 import MIRROR, angles_between
 from pliant.solver.monitor import enter
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, read_only
 from pliant.solver.refinement.bas_relief import at_probable_depth, bulges, is_typical
 from pliant.solver.refinement.covariance_learning import LearningData
@@ -50,7 +50,7 @@ def refine_cameras(
     estimates_scales: bool = False,
     seed: int = 0,
     y_up: bool = False,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> tuple[CameraEstimate, LearningData]:
     """Return the cameras, refined if `turning`, and the data from which the shape covariance of all frames is learned.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,6 +10,7 @@ from pliant.solver.model.expectation_maximisation import ModelOrder, annealed, l
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, fit, metric_of, root_of
 from pliant.solver.model.shape_covariance import AXIS_VARIANCE_FLOOR, NOISE_VARIANCE_FLOOR, ShapeCovariance
 from pliant.solver.model.so3 import exponential, logarithm
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.tracks.frame_selection import between
 from pliant.solver.tracks.matrix import centred, columns
@@ -63,12 +63,8 @@ class Refinement:
     with_scales: bool = False
     """Whether scales are refined; False keeps them at 1."""
 
-    should_stop: Callable[[], bool] | None = None
+    should_stop: ShouldStop = never
     """Called between units of work; once it returns True, the best so far is returned."""
-
-    def stopped(self) -> bool:
-        """Call `should_stop`, if given, and return its answer."""
-        return self.should_stop is not None and self.should_stop()
 
     def learn(self, gram: Floats, rotations: Floats, scales: Floats, *, iterations: int = START_EM_ROUNDS) -> Learned:
         """Return given cameras and a covariance learned for them from scratch, in at most `iterations` EM rounds.
@@ -100,7 +96,7 @@ class Refinement:
     def refine(self, gram: Floats, found: Learned, *, rounds: int) -> Learned:
         """Return cameras and covariance after `rounds` calls of `refine_once`, fewer after a stop."""
         for _ in range(rounds):
-            if self.stopped():
+            if self.should_stop():
                 break
             found = self.refine_once(gram, found)
         return found

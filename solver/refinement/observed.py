@@ -8,7 +8,6 @@ L-BFGS on the marginal likelihood as its M-step.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +16,7 @@ from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import Perspective, corrected, depth_map
 from pliant.solver.model.expectation_maximisation import ModelOrder, learned
 from pliant.solver.model.observation_model import ImageDensity, inlier_probabilities
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.refinement.learned import START_EM_ROUNDS, Learned, Refinement
 from pliant.solver.tracks.completion import often_visible
@@ -88,7 +88,7 @@ def cross_fitted(
     used: NDArray[np.intp],
     *,
     seed: int,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> tuple[Floats, float]:
     """Return the probability that each observation is an inlier, shape `(F', S)`, and the share of outliers.
 
@@ -155,11 +155,11 @@ def on_observations(
     how : Refinement
         What is refined.
     """
-    if how.stopped():
+    if how.should_stop():
         return found, completed
     moments = _expected(observed, found, completed, start_scales)
     for _ in range(ROUNDS):
-        if how.stopped():
+        if how.should_stop():
             break
         found = how.refine_once(moments.gram, found)
         moments = _expected(observed, found, moments, start_scales)

@@ -6,7 +6,6 @@ decrease their sum. The energy cannot increase, however few iterations are run.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +17,7 @@ from pliant.solver.linear import block_tridiagonal
 from pliant.solver.linear.conjugate_gradient import conjugate_gradient
 from pliant.solver.linear.preconditioner import build_preconditioner
 from pliant.solver.operators.normal_equations import Operator
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.shapes.state import State
 from pliant.solver.solution import Outcome
@@ -45,7 +45,7 @@ def step(
     state: State,
     *,
     tolerance: float = 0.0,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> State:
     """Do one reweighting: shapes for the weights of `state`, then translations, then new weights.
 
@@ -58,19 +58,18 @@ def step(
     """
     operator = operator_at(problem, state)
     downhill = _downhill(problem, state, operator)
-    tick = should_stop if should_stop is not None else bool
-    tick()
+    should_stop()
     inner = operator.rounded(inner_precision(operator, state.reduction))
     precondition = build_preconditioner(inner)
     downhill = downhill.astype(inner.weights.dtype, copy=False)
-    tick()
+    should_stop()
     solved = conjugate_gradient(
         inner.apply, downhill, precondition=precondition, reduction=state.reduction, max_iterations=MAX_INNER,
         negligible=NEGLIGIBLE * tolerance * abs(state.objective), should_stop=should_stop,
     )  # fmt: skip
     del downhill, precondition, inner  # before the next weights are allocated
     shapes = np.add(state.shapes, solved.x, out=solved.x if solved.x.dtype == state.shapes.dtype else None)
-    tick()
+    should_stop()
     after = _evaluated(problem, shapes, state.translations, state.omega, reweighting=state.reweighting + 1)
     gained = state.objective - after.objective
     unforeseen = abs(gained - solved.decrease) / gained if gained > 0 else INNER_REDUCTION

@@ -17,7 +17,6 @@ Bayes confidence intervals based on bootstrap samples").
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +29,7 @@ from pliant.solver.model.expectation_maximisation import ModelOrder, improve
 from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.observation_model import ImageDensity
 from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import MIN_POINTS, Floats
 from pliant.solver.refinement.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.shapes.uncertainty import distant_paths
@@ -92,7 +92,7 @@ def learning_changes(
     *,
     turning: bool,
     seed: int = 0,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> Changes:
     """Return how far positions change with the points from which cameras and prior are learned.
 
@@ -129,7 +129,7 @@ def learning_changes(
         early = schedule(points, _projections(start), order, seed=seed, should_stop=should_stop)
         part_of, everything = parts(points), _shapes_from(sample, every, start, early, turning)
         for part in np.unique(part_of):
-            if should_stop is not None and should_stop():
+            if should_stop():
                 return nothing
             if (part_of != part).sum() >= MIN_POINTS:
                 without.append(_onto(_shapes_from(sample, part_of != part, start, early, turning), everything))

@@ -9,13 +9,14 @@ P; all points are then projected onto the basis in one pass.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.agreement import check_seen
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.threads import SMALLEST, over_ranges
 from pliant.solver.tracks.matrix import centred, columns
@@ -108,9 +109,7 @@ class Completed:
     """Indices of the sampled points, shape `(S,)`."""
 
 
-def complete(
-    normalized: Normalized, *, seed: int = 0, rank: int = 0, should_stop: Callable[[], bool] | None = None
-) -> Completed:
+def complete(normalized: Normalized, *, seed: int = 0, rank: int = 0, should_stop: ShouldStop = never) -> Completed:
     """Fill hidden entries, replace gross outliers, and return the Gram matrix of the result.
 
     Parameters
@@ -205,7 +204,7 @@ def ranks(points: Floats) -> NDArray[np.intp]:
 
 def fit_basis(
     points: Floats, weight: Floats, random: np.random.Generator, given: int = 0, *,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> tuple[Floats, Floats, float]:  # fmt: skip
     """Return the basis (F, 2, r) with the translation last, the covariance of its coefficients, and the residual scale.
 
@@ -229,7 +228,7 @@ def fit_basis(
             best_error, best_rank, best = error, rank, basis
         elif rank > 2 * best_rank:
             break
-        if rank == given or (should_stop is not None and should_stop()):
+        if rank == given or should_stop():
             break
     if not np.isfinite(best_error):
         best = _widen(np.zeros((frames, 2, 0)), points, weight, start, min(3, min(2 * frames, count) - 1))
@@ -354,16 +353,16 @@ def spans(normalized: Normalized, filling: Filling | None) -> Iterator[tuple[NDA
 
 
 def _carry(
-    normalized: Normalized, filling: Filling | None, chosen: NDArray[np.intp], tick: Callable[[], bool] | None
+    normalized: Normalized, filling: Filling | None, chosen: NDArray[np.intp], should_stop: ShouldStop
 ) -> tuple[Floats, Floats, Floats]:
-    """Return Gram matrix, translations and centred sample, completed chunk by chunk; call `tick`, but ignore its result."""
+    """Return Gram matrix, translations and centred sample, completed chunk by chunk; call `should_stop`, but ignore its result."""
     frames = len(normalized.points)
     gram, total = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2))
     sample = np.zeros((frames, len(chosen), 2))
     used, often = 0, often_visible(normalized.visible)
     for number, (places, points) in enumerate(spans(normalized, filling), start=1):
-        if number % CHUNKS_PER_TICK == 0 and tick is not None:
-            tick()
+        if number % CHUNKS_PER_TICK == 0:
+            should_stop()
         inside = np.isin(places, chosen, assume_unique=True)
         sample[:, np.isin(chosen, places, assume_unique=True)] = points[:, inside]
         points = points[:, often[places]]

@@ -12,6 +12,7 @@ from pliant.solver.cameras.perspective import depth_map
 from pliant.solver.model.early_stopping import learn_with_early_stopping
 from pliant.solver.model.expectation_maximisation import ModelOrder, annealed
 from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.pulse import never
 from pliant.solver.records import MIN_POINTS, Floats
 from pliant.solver.shapes.jackknife import PARTS, learning_changes, parts
 from pliant.solver.tracks.matrix import centred, columns
@@ -45,7 +46,7 @@ def learning_std(
     *,
     turning: bool,
     observed: np.ndarray | None = None,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: Callable[[], bool] = never,
 ) -> Floats:
     observed = np.ones(estimate.sample.shape[:2], dtype=bool) if observed is None else observed
     found = learning_changes(estimate, covariance, observed, turning=turning, should_stop=should_stop)

@@ -8,6 +8,7 @@ import numpy as np
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.operators.gauss_markov import PathPrior
+from pliant.solver.pulse import never
 from pliant.solver.refinement.covariance_learning import learn_covariance
 from pliant.solver.refinement.joint_refinement import refine_cameras
 from pliant.solver.tracks.normalization import Normalized
@@ -16,7 +17,7 @@ from pliant.solver.tracks.normalization import Normalized
 def learn(estimate: CameraEstimate, normalized: Normalized, **more: Any) -> tuple[CameraEstimate, ShapeCovariance]:
     """Return the cameras of `refine_cameras`, learned from every frame, and the covariance of `learn_covariance`."""
     refined, data = refine_cameras(estimate, normalized, np.ones(len(normalized.points), dtype=bool), **more)
-    return learn_covariance(refined, data, should_stop=more.get("should_stop"))
+    return learn_covariance(refined, data, should_stop=more.get("should_stop", never))
 
 
 def dense_precisions(prior: PathPrior) -> np.ndarray:
