@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.isometry.inextensible import Indices
+from pliant.solver.model.so3 import nearest
 from pliant.solver.records import Floats
 from pliant.solver.tracks.noise import RAYLEIGH_MEDIAN
 from scipy import sparse
@@ -199,5 +199,5 @@ def _alike(points: Floats, seen: NDArray[np.bool_], frame: int) -> Indices:
 def _moved(source: Floats, target: Floats, used: NDArray[np.bool_]) -> Floats:
     """Return `source (A, 3)` after the rigid motion that aligns its `used` points with those of `target`."""
     here, there = source[used].mean(axis=0), target[used].mean(axis=0)
-    turn = procrustes((target[used] - there).T @ (source[used] - here), proper=True)
+    turn = nearest((target[used] - there).T @ (source[used] - here))
     return np.asarray((source - here) @ turn.T + there)

@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import depth_map
-from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.model.early_stopping import Schedule, schedule
 from pliant.solver.model.expectation_maximisation import ModelOrder, improve
 from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.observation_model import ImageDensity
 from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.model.so3 import nearest
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import MIN_POINTS, Floats
 from pliant.solver.refinement.learned import Learned, motion_of, moved_to, scene_at
@@ -219,5 +219,5 @@ def _projections(found: Learned) -> Floats:
 def _onto(shapes: Floats, others: Floats) -> Floats:
     """Return the shapes with each frame centred and rotated onto the same frame of `others`."""
     moved, fixed = centred(shapes), centred(others)
-    turns = procrustes(fixed.transpose(0, 2, 1) @ moved, proper=True)
+    turns = nearest(fixed.transpose(0, 2, 1) @ moved)
     return np.asarray(moved @ turns.transpose(0, 2, 1))
