@@ -183,9 +183,7 @@ def _with_shapes(
         used = np.flatnonzero(shown)
         some = used[evenly_spread(len(used), LEARNED_FRAMES)]
         how = Refinement(ModelOrder(ordered=estimate.ordered), turning=observations.turning, should_stop=monitor)
-        estimate = correct_perspective(
-            Evidence.of(estimate, normalized, some, np.asarray(estimate.scales)), how
-        ).estimate
+        estimate = correct_perspective(Evidence.of(estimate, normalized, some, estimate.scales), how).estimate
     return estimate, data
 
 
@@ -211,7 +209,7 @@ def camera_of(estimate: CameraEstimate, observations: Observations) -> Camera:
     camera = Camera(
         np.array(estimate.rotations, dtype=np.float64),
         np.array(estimate.scales, dtype=np.float64) * observations.world_scale,
-        normalized.centroid + normalized.unit * np.asarray(estimate.translations),
+        normalized.centroid + normalized.unit * estimate.translations,
         y_up=observations.settings.y_up,
     )
     if view is not None:

@@ -57,9 +57,9 @@ def extended(
     enter(should_stop, "extension")
     frames = len(observations.normalized.points)
     turning = observations.turning
-    scales, thin = np.asarray(estimate.scales), np.asarray(estimate.rotations)
+    scales, thin = estimate.scales, estimate.rotations
     with_scales = bool((scales != 1).any()) and not _has_scales(observations)
-    shapes = MeanShapes.of(covariance, thin, scales, np.asarray(estimate.sample))
+    shapes = MeanShapes.of(covariance, thin, scales, estimate.sample)
     chosen = estimate.sampled
     views = _views(observations, estimate, chosen)
     poses = interpolated(used, thin, scales, covariance.modes, frames)

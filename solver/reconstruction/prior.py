@@ -163,7 +163,7 @@ def estimate_with(cameras: Cameras, prior: Prior) -> CameraEstimate:
     if prior.estimate.rotations is cameras.estimate.rotations:
         return prior.estimate
     reasons = {**cameras.estimate.reasons, "modes": prior.reason}
-    rotations, scales = np.asarray(cameras.estimate.rotations), np.asarray(cameras.estimate.scales)
+    rotations, scales = cameras.estimate.rotations, cameras.estimate.scales
     if np.array_equal(rotations, prior.estimate.rotations) and np.array_equal(scales, prior.estimate.scales):
         return replace(prior.estimate, reasons=reasons, warnings=cameras.warnings)  # with completed tracks
     estimate = replace(cameras.estimate, reasons=reasons)

@@ -251,8 +251,8 @@ def _without_outliers(start: Start, monitor: Monitor) -> Start:
     if filling is not None:
         found = gross_outliers(
             start.flat if start.part is None else start.part.normalized,
-            np.asarray(estimate.rotations)[:, :2] * np.asarray(estimate.scales)[:, None, None],
-            np.asarray(estimate.translations), covariance, filling, share=start.outliers, should_stop=monitor,
+            estimate.rotations[:, :2] * estimate.scales[:, None, None],
+            estimate.translations, covariance, filling, share=start.outliers, should_stop=monitor,
         )  # fmt: skip
         without = replace(problem, confidence=np.where(found, 0, problem.confidence).astype(problem.confidence.dtype))
         start = replace(start, problem=without, state=init(without, start.state.shapes, start.state.translations))

@@ -73,7 +73,7 @@ def refine_cameras(
     should_stop : callable, optional
         Called between refinements; once it returns True, the best so far is returned.
     """
-    evidence = Evidence.of(estimate, normalized, np.flatnonzero(shown), np.asarray(estimate.scales))
+    evidence = Evidence.of(estimate, normalized, np.flatnonzero(shown), estimate.scales)
     enter(should_stop, "model_order")
     model_order = select_model_order(
         evidence.sample, evidence.projections, ordered=estimate.ordered, seed=seed, should_stop=should_stop
@@ -99,7 +99,7 @@ def refine_cameras(
     return estimate, LearningData(
         evidence.gram, evidence.sample, found.rotations[:, :2] * found.scales[:, None, None], evidence.used, model_order,
         stopped=None if np.isfinite(found.energy) else found.covariance,
-        rotations=rotations, scales=np.asarray(estimate.scales), turned=True,
+        rotations=rotations, scales=estimate.scales, turned=True,
     )  # fmt: skip
 
 
@@ -116,7 +116,7 @@ def _with_kept_rotations(
     estimate = evidence.estimate
     return estimate, LearningData(
         evidence.gram, evidence.sample, evidence.projections, evidence.used, how.model_order, stopped=None,
-        rotations=np.asarray(estimate.rotations), scales=np.asarray(estimate.scales), turned=False,
+        rotations=estimate.rotations, scales=estimate.scales, turned=False,
     )  # fmt: skip
 
 
@@ -230,7 +230,7 @@ def _of_all_frames(
         estimate = _with_scale_reason(estimate, trial)
     if (found.scales != 1).any():
         estimate = replace(estimate, scales=_at_all_frames(used, found.scales * evidence.start_scales[used], frames))
-    return _with_rotation_reason(estimate, rotations, np.asarray(start.estimate.rotations)), rotations
+    return _with_rotation_reason(estimate, rotations, start.estimate.rotations), rotations
 
 
 def _of_observations(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evidence, Learned]:

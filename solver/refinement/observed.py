@@ -107,9 +107,9 @@ def cross_fitted(
     should_stop : callable, optional
         Called between rounds of EM.
     """
-    scales = np.asarray(estimate.scales)[used]
-    projections = np.asarray(estimate.rotations)[used, :2] * scales[:, None, None]
-    points = observed.points - np.asarray(estimate.translations)[used, None]
+    scales = estimate.scales[used]
+    projections = estimate.rotations[used, :2] * scales[:, None, None]
+    points = observed.points - estimate.translations[used, None]
     points = np.where(observed.confidence[..., None] > 0, points, 0.0)
     part = np.random.default_rng(seed).permutation(points.shape[1]) % FOLDS
     found, shares = np.zeros(observed.confidence.shape), []

@@ -57,7 +57,7 @@ def best_start(evidence: Evidence, how: Refinement) -> CameraEstimate:
     part, ones = of_frames(evidence.gram, some), np.ones(len(some))
 
     def begun(start: CameraEstimate, margin: float) -> _Trial:
-        given = np.asarray(start.rotations)[evidence.used[some]]
+        given = start.rotations[evidence.used[some]]
         return _Trial(start, margin, how.learn(part, given, ones, iterations=COMPARED_EM_ROUNDS)).refined(part, how)
 
     own, others = begun(estimate, 0.0), []

@@ -114,12 +114,12 @@ def learning_changes(
     frames, nothing = len(estimate.rotations), Changes(None, np.zeros((0, 3)))
     used = evenly_spread(frames, MAX_JACKKNIFE_FRAMES)
     start = Learned(
-        np.asarray(estimate.rotations)[used],
-        np.asarray(estimate.scales)[used],
+        estimate.rotations[used],
+        estimate.scales[used],
         replace(covariance, modes=covariance.modes[used]),
         np.inf,
     )
-    sample = _Sample(centred(np.asarray(estimate.sample)[used]), observed[used])
+    sample = _Sample(centred(estimate.sample[used]), observed[used])
     if sample.points.shape[1] <= MIN_POINTS:
         return nothing
     every, without = np.ones(sample.points.shape[1], dtype=bool), []
@@ -138,7 +138,7 @@ def learning_changes(
     if len(without) < 2:
         return nothing
     squared = between(used, _mean_squared_change(np.stack(without), everything), frames)
-    squared /= np.square(np.asarray(estimate.scales))[:, None]
+    squared /= np.square(estimate.scales)[:, None]
     world = np.einsum("fij,fpi->pj", start.rotations / start.scales[:, None, None], everything) / len(used)
     return Changes(np.sqrt(squared), world)
 
