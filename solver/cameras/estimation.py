@@ -22,7 +22,7 @@ from pliant.solver.cameras.scale import rigid_evidence, rigid_scales
 from pliant.solver.model.so3 import angles_between, start_at_identity
 from pliant.solver.monitor import enter
 from pliant.solver.pulse import ShouldStop, never
-from pliant.solver.records import Floats, KnownCamera, read_only
+from pliant.solver.records import Floats, KnownCamera, projections_of, read_only
 from pliant.solver.settings import Settings
 from pliant.solver.tracks.completion import Completed, Filling, complete
 from pliant.solver.tracks.frame_selection import every_nth, of_frames
@@ -112,6 +112,11 @@ class CameraEstimate:
 
     depth_is_typical: bool = False
     """Whether the prior, not the tracks, determines the extent of depth (`refinement.bas_relief`)."""
+
+    @property
+    def projections(self) -> Floats:
+        """Shape `(F, 2, 3)`, see `projections_of`."""
+        return projections_of(self.rotations, self.scales)
 
 
 def estimate_cameras(

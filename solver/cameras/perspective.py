@@ -30,7 +30,7 @@ from pliant.solver.model.marginal_likelihood import root_matrix
 from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR
-from pliant.solver.records import Floats
+from pliant.solver.records import Floats, projections_of
 from pliant.solver.tracks.completion import Filling, often_visible, spans
 from pliant.solver.tracks.matrix import centred, columns
 from pliant.solver.tracks.normalization import Normalized
@@ -134,8 +134,8 @@ def depth_map(rotations: Floats, scales: Floats, covariance: ShapeCovariance) ->
     """Return D, shape `(F, 2F)`, which maps centred image coordinates x1, y1, x2 … of a point to its depths."""
     if len(rotations) > LEARNED_FRAMES:
         away = rotations[:, 2] * scales[:, None]
-        return DepthMap(away, covariance.image_model(rotations[:, :2] * scales[:, None, None]), covariance)
-    projections = rotations[:, :2] * scales[:, None, None]
+        return DepthMap(away, covariance.image_model(projections_of(rotations, scales)), covariance)
+    projections = projections_of(rotations, scales)
     away, rows = rotations[:, 2] * scales[:, None], projections.reshape(-1, 3)
     wide = np.repeat(covariance.over_frames(), 2, axis=1)
     cross = away @ covariance.mean_covariance @ rows.T + (away @ covariance.axis_covariance @ rows.T) * wide

@@ -28,7 +28,7 @@ from pliant.solver.model.marginal_likelihood import UNLIKELY, Scene, cameras_and
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import vee
 from pliant.solver.pulse import ShouldStop, never
-from pliant.solver.records import Floats
+from pliant.solver.records import Floats, projections_of
 from scipy.optimize import minimize
 
 POINTS_PER_COEFFICIENT = 4
@@ -118,7 +118,7 @@ def energy(scene: Scene, axis_covariance: Floats, basis: Basis) -> tuple[float, 
     """
     frames, size = basis.weights.shape
     rotations, scales, jacobian = cameras_and_jacobian(scene, basis)
-    projections = rotations[:, :2] * scales[:, None, None]
+    projections = projections_of(rotations, scales)
     root = root_matrix(axis_covariance)
     shapes = np.einsum("fk,fid->fikd", basis.weights, projections).reshape(2 * frames, 3 * size)
     noise, walk_variance = np.exp(2 * basis.logs)

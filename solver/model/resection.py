@@ -22,7 +22,7 @@ from pliant.solver.model.marginal_likelihood import root_matrix
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential, from_rows, logarithm
 from pliant.solver.pulse import ShouldStop, never
-from pliant.solver.records import Floats
+from pliant.solver.records import Floats, projections_of
 from pliant.solver.threads import over_ranges
 from pliant.solver.tracks.matrix import columns
 from scipy.spatial.transform import Rotation, Slerp
@@ -68,7 +68,7 @@ class MeanShapes:
     @classmethod
     def of(cls, covariance: ShapeCovariance, rotations: Floats, scales: Floats, sample: Floats) -> MeanShapes:
         """Return the shapes for cameras and complete tracks `(F, S, 2)` of the frames that the covariance was learned from."""
-        projections = rotations[:, :2] * scales[:, None, None]
+        projections = projections_of(rotations, scales)
         found = Explained.of(covariance.image_model(projections), columns(sample)).means
         found = found.reshape(covariance.modes.shape[1] + 1, 3, -1)
         off = covariance.modes[1:-1] - (covariance.modes[:-2] + covariance.modes[2:]) / 2
@@ -316,7 +316,7 @@ def _stepped(shapes: MeanShapes, poses: Poses, at: _Fit, damping: Floats, turnin
     """Return the poses after a damped Gauss–Newton step."""
     frames, count, points = len(at.cost), len(shapes.modes), shapes.mean.shape[1]
     slopes = np.zeros((frames, count + 6, 2, points))
-    cameras = poses.scales[:, None, None] * poses.rotations[:, :2]
+    cameras = projections_of(poses.rotations, poses.scales)
     modes = cameras @ shapes.modes.transpose(1, 0, 2).reshape(3, -1)
     slopes[:, :count] = modes.reshape(frames, 2, count, points).transpose(0, 2, 1, 3)
     slopes[:, count, 0] = slopes[:, count + 1, 1] = 1.0

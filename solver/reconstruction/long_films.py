@@ -21,7 +21,7 @@ from pliant.solver.model.so3 import angles_between, start_at_identity
 from pliant.solver.monitor import enter
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.reconstruction.observations import Observations
-from pliant.solver.records import Floats, read_only
+from pliant.solver.records import Floats, projections_of, read_only
 from pliant.solver.refinement.covariance_learning import LearningData
 from pliant.solver.refinement.learned import Learned, Refinement
 from pliant.solver.tracks.completion import Filling, gross
@@ -151,7 +151,7 @@ def _whole(
         perspective=_perspective(estimate, observations, views, shapes, poses, whole, rotations, scales, filling),
     )  # fmt: skip
     data = LearningData(
-        np.zeros((0, 0)), sample, rotations[:, :2] * scales[:, None, None], np.arange(len(rotations)),
+        np.zeros((0, 0)), sample, projections_of(rotations, scales), np.arange(len(rotations)),
         ModelOrder(ordered=covariance.ordered), stopped=whole,
         rotations=rotations, scales=scales, turned=False,
     )  # fmt: skip
@@ -173,7 +173,7 @@ def _filling(
     covariance: ShapeCovariance, rotations: Floats, scales: Floats, poses: Poses, shapes: MeanShapes
 ) -> Filling:
     """Return the low-rank factor that predicts hidden entries of any point: the images of the covariance's columns."""
-    images = covariance.image_model(rotations[:, :2] * scales[:, None, None]).columns.reshape(len(rotations), 2, -1)
+    images = covariance.image_model(projections_of(rotations, scales)).columns.reshape(len(rotations), 2, -1)
     basis = np.concatenate([images, poses.translations[:, :, None]], axis=2)
     return Filling(basis, np.eye(images.shape[2]), shapes.variance**0.5)
 

@@ -251,7 +251,7 @@ def _without_outliers(start: Start, monitor: Monitor) -> Start:
     if filling is not None:
         found = gross_outliers(
             start.flat if start.part is None else start.part.normalized,
-            estimate.rotations[:, :2] * estimate.scales[:, None, None],
+            estimate.projections,
             estimate.translations, covariance, filling, share=start.outliers, should_stop=monitor,
         )  # fmt: skip
         without = replace(problem, confidence=np.where(found, 0, problem.confidence).astype(problem.confidence.dtype))

@@ -107,7 +107,7 @@ def bulges(found: Learned, sample: Floats, *, y_up: bool) -> bool:
         Whether y points up in the images, and z therefore toward the camera.
     """
     frames = len(sample)
-    rows = (found.rotations[:, :2] * found.scales[:, None, None]).reshape(2 * frames, 3)
+    rows = found.projections.reshape(2 * frames, 3)
     rigid = np.linalg.pinv(rows) @ columns(sample)
     toward = _decomposed(found.rotations)[0]
     depth = (toward @ rigid) * (-1 if y_up else 1)

@@ -97,7 +97,7 @@ def refine_cameras(
     if not evidence.bends and not bulges(found, evidence.sample, y_up=y_up):
         estimate, rotations, found = _mirrored(estimate, rotations, found)
     return estimate, LearningData(
-        evidence.gram, evidence.sample, found.rotations[:, :2] * found.scales[:, None, None], evidence.used, model_order,
+        evidence.gram, evidence.sample, found.projections, evidence.used, model_order,
         stopped=None if np.isfinite(found.energy) else found.covariance,
         rotations=rotations, scales=estimate.scales, turned=True,
     )  # fmt: skip

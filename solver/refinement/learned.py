@@ -11,7 +11,7 @@ from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, c
 from pliant.solver.model.shape_covariance import AXIS_VARIANCE_FLOOR, NOISE_VARIANCE_FLOOR, ShapeCovariance
 from pliant.solver.model.so3 import exponential, logarithm
 from pliant.solver.pulse import ShouldStop, never
-from pliant.solver.records import Floats
+from pliant.solver.records import Floats, projections_of
 from pliant.solver.tracks.frame_selection import between
 from pliant.solver.tracks.matrix import centred, columns
 
@@ -43,6 +43,11 @@ class Learned:
 
     energy: float
     """Energy of `model.marginal_likelihood`, without a penalty on modes; infinite before the first refinement."""
+
+    @property
+    def projections(self) -> Floats:
+        """Shape `(F, 2, 3)`, see `projections_of`."""
+        return projections_of(self.rotations, self.scales)
 
     @property
     def scaled(self) -> bool:
@@ -81,7 +86,7 @@ class Refinement:
             Maximum number of EM rounds.
         """
         covariance = learned(
-            gram, rotations[:, :2] * scales[:, None, None], self.model_order, iterations=iterations, should_stop=self.should_stop
+            gram, projections_of(rotations, scales), self.model_order, iterations=iterations, should_stop=self.should_stop
         )  # fmt: skip
         return Learned(rotations, scales, covariance, np.inf)
 
@@ -89,7 +94,7 @@ class Refinement:
         """Return what `learn` returns by annealing alone, without stops, from orthographic tracks `(F, S, 2)`."""
         rows = columns(centred(images))
         covariance = annealed(
-            rows @ rows.T / rows.shape[1], rotations[:, :2] * scales[:, None, None], self.model_order, iterations=iterations
+            rows @ rows.T / rows.shape[1], projections_of(rotations, scales), self.model_order, iterations=iterations
         )  # fmt: skip
         return Learned(rotations, scales, covariance, np.inf)
 

@@ -170,7 +170,7 @@ def _expected(observed: Observed, found: Learned, before: Moments, start_scales:
     """Return the moments under these cameras and this covariance; the tracks are corrected with the depths of `before`."""
     points = _corrected(observed, found, before, start_scales) - before.translations[:, None]
     points = np.where(observed.confidence[..., None] > 0, points / start_scales[:, None, None], 0.0)
-    projections = found.rotations[:, :2] * found.scales[:, None, None]
+    projections = found.projections
     image, noise = found.covariance.of_image(projections), found.covariance.noise_variance
     probability, share = inlier_probabilities(
         image, noise, points, observed.confidence, observed.weight, share=before.outliers

@@ -84,7 +84,7 @@ def assessed(
     should_stop()
     confidence = np.asarray(confidence, dtype=np.float64)
     if covariance is not None:
-        projections = estimate.scales[:, None, None] * estimate.rotations[:, :2]
+        projections = estimate.projections
         pinhole = Pinhole.of(solution.camera, solution.shapes, unit)
         std = position_std(
             covariance, projections, confidence, noise_std=noise_std(covariance), pinhole=pinhole, seed=seed

@@ -126,7 +126,7 @@ def learning_changes(
     try:
         points = points_of(sample.expected(start, every)[0])
         order = ModelOrder(ordered=covariance.ordered)
-        early = schedule(points, _projections(start), order, seed=seed, should_stop=should_stop)
+        early = schedule(points, start.projections, order, seed=seed, should_stop=should_stop)
         part_of, everything = parts(points), _shapes_from(sample, every, start, early, turning)
         for part in np.unique(part_of):
             if should_stop():
@@ -159,7 +159,7 @@ class _Sample:
         if observed.all():
             rows = columns(points)
             return rows, rows @ rows.T / rows.shape[1]
-        image = found.covariance.of_image(_projections(found))
+        image = found.covariance.of_image(found.projections)
         density = ImageDensity.of(image, found.covariance.noise_variance)
         means, covariance = density.moments(np.where(observed[..., None], points, 0.0), observed.astype(np.float64))
         return means, (means @ means.T + covariance) / means.shape[1]
@@ -194,7 +194,7 @@ def _shapes_from(
     gram = sample.expected(start, kept)[1]
 
     def relearned(found: Learned) -> Learned:
-        projections = _projections(found)
+        projections = found.projections
         if early is None:
             return replace(found, covariance=improve(found.covariance, gram, projections, iterations=LEARNING_ROUNDS))
         return replace(found, covariance=early.learned(gram, projections))
@@ -210,10 +210,6 @@ def _shapes_from(
     means, _ = sample.expected(found, np.ones(kept.shape, dtype=bool))
     depths = depth_map(found.rotations, found.scales, found.covariance) @ means
     return np.concatenate([points_of(means), depths[..., None]], axis=2)
-
-
-def _projections(found: Learned) -> Floats:
-    return np.asarray(found.rotations[:, :2] * found.scales[:, None, None])
 
 
 def _onto(shapes: Floats, others: Floats) -> Floats:
