@@ -29,7 +29,7 @@ from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import MAX_SAMPLE_POINTS
-from pliant.solver.tracks.matrix import columns
+from pliant.solver.tracks.matrix import columns, gram_of
 
 FOLDS = 3
 """Folds of the cross-validation over points."""
@@ -137,7 +137,7 @@ def _judged(points: Floats, projections: Floats, way: Schedule, seed: int, shoul
     paths, others = [], []
     for fold in range(FOLDS):
         own = points[:, part != fold]
-        paths.append(_rounds(own @ own.T / own.shape[1], projections, way.model_order, way.floors))
+        paths.append(_rounds(gram_of(own), projections, way.model_order, way.floors))
         others.append(points[:, part == fold])
     found: list[float] = []
     for covariances in zip(*paths, strict=True):

@@ -21,7 +21,7 @@ from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import ranks
 from pliant.solver.tracks.frame_selection import evenly_spread
-from pliant.solver.tracks.matrix import columns
+from pliant.solver.tracks.matrix import columns, gram_of
 from pliant.solver.tracks.noise import typical_roughness
 
 MODE_COUNTS = (0, 2, 4, 8, 16, 32, MAX_MODES)
@@ -98,7 +98,7 @@ def _judged(
 ) -> Floats:
     """Return the held-out negative log likelihood for each number of modes; `model_order` determines the start."""
     frames = len(projections)
-    gram = points @ points.T / points.shape[1]
+    gram = gram_of(points)
     counts = _counts(frames)
     energies = np.full(len(counts), np.inf)
     for index, max_modes in enumerate(counts):

@@ -22,7 +22,7 @@ from pliant.solver.refinement.focal_length import refine_with_focal
 from pliant.solver.refinement.learned import Learned, Refinement
 from pliant.solver.refinement.starts import START_FRAMES
 from pliant.solver.tracks.frame_selection import evenly_spread
-from pliant.solver.tracks.matrix import centred, columns
+from pliant.solver.tracks.matrix import centred, columns, gram_of
 
 ALTERNATION_ROUNDS = 3
 """Updates of depths, covariance, cameras and κ each time that cameras were found or refined."""
@@ -102,7 +102,7 @@ def refactorize(
 
     turns = towards(view.learning_sample.mean(axis=1), view.curvature)
     rows = columns(_turned(view, turns) / scales[:, None, None])
-    gram = rows @ rows.T / rows.shape[1]
+    gram = gram_of(rows)
     limit = min(len(gram) // 3, view.learning_sample.shape[1] // 3)
     best, lowest = None, energy(part)
     for each in upgrades(gram, [size for size in CANDIDATES if size <= limit]):

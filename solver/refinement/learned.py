@@ -13,7 +13,7 @@ from pliant.solver.model.so3 import exponential, logarithm
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, projections_of
 from pliant.solver.tracks.frame_selection import between
-from pliant.solver.tracks.matrix import centred, columns
+from pliant.solver.tracks.matrix import centred, columns, gram_of
 
 REFINEMENT_PRIOR_WEIGHT = 0.01
 """Weight of the camera-motion prior: less is needed once the covariance is known."""
@@ -94,7 +94,7 @@ class Refinement:
         """Return what `learn` returns by annealing alone, without stops, from orthographic tracks `(F, S, 2)`."""
         rows = columns(centred(images))
         covariance = annealed(
-            rows @ rows.T / rows.shape[1], projections_of(rotations, scales), self.model_order, iterations=iterations
+            gram_of(rows), projections_of(rotations, scales), self.model_order, iterations=iterations
         )  # fmt: skip
         return Learned(rotations, scales, covariance, np.inf)
 

@@ -20,7 +20,7 @@ from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.refinement.learned import START_EM_ROUNDS, Learned, Refinement
 from pliant.solver.tracks.completion import often_visible
-from pliant.solver.tracks.matrix import columns, points_of
+from pliant.solver.tracks.matrix import columns, gram_of, points_of
 from pliant.solver.tracks.normalization import Normalized
 
 ROUNDS = 3
@@ -117,7 +117,7 @@ def cross_fitted(
         others, own = estimate.sample[used][:, part != fold], part == fold
         rows = columns(others)
         covariance = learned(
-            rows @ rows.T / rows.shape[1],
+            gram_of(rows),
             projections,
             ModelOrder(ordered=estimate.ordered),
             iterations=START_EM_ROUNDS,

@@ -34,7 +34,7 @@ from pliant.solver.records import MIN_POINTS, Floats
 from pliant.solver.refinement.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.shapes.uncertainty import distant_paths
 from pliant.solver.tracks.frame_selection import between, evenly_spread
-from pliant.solver.tracks.matrix import centred, columns, points_of
+from pliant.solver.tracks.matrix import centred, columns, gram_of, points_of
 from scipy.spatial import cKDTree
 
 PARTS = 6
@@ -158,7 +158,7 @@ class _Sample:
         points, observed = self.points[:, kept], self.observed[:, kept]
         if observed.all():
             rows = columns(points)
-            return rows, rows @ rows.T / rows.shape[1]
+            return rows, gram_of(rows)
         image = found.covariance.of_image(found.projections)
         density = ImageDensity.of(image, found.covariance.noise_variance)
         means, covariance = density.moments(np.where(observed[..., None], points, 0.0), observed.astype(np.float64))
