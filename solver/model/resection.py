@@ -24,6 +24,7 @@ from pliant.solver.model.so3 import exponential, from_rows, logarithm
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, projections_of
 from pliant.solver.threads import over_ranges
+from pliant.solver.tracks.frame_selection import between
 from pliant.solver.tracks.matrix import columns
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -160,13 +161,11 @@ def interpolated(used: NDArray[np.intp], rotations: Floats, scales: Floats, mode
     """Return the poses of all frames of a film, interpolated between those of the frames used."""
     at = np.clip(np.arange(num_frames), used[0], used[-1])
     turned = rotations_between(used, rotations, num_frames)
-    coefficients = np.zeros((num_frames, modes.shape[1]))
-    for number, mode in enumerate(modes.T):
-        coefficients[:, number] = np.interp(at, used, mode)
+    coefficients = between(used, modes, num_frames)
     before = np.clip(np.searchsorted(used, at, side="right") - 1, 0, len(used) - 2)
     share = (at - used[before]) / (used[before + 1] - used[before])
     doubt = np.where(at == np.arange(num_frames), np.maximum(4 * share * (1 - share), LEARNED_DOUBT), 1.0)
-    scales = np.exp(np.interp(at, used, np.log(scales)))
+    scales = np.exp(between(used, np.log(scales), num_frames))
     return Poses(turned, scales, coefficients, np.zeros((num_frames, 2)), coefficients, turned, doubt)
 
 

@@ -153,7 +153,7 @@ def _with_scale_reason(estimate: CameraEstimate, trial: ScaleTrial) -> CameraEst
 
 def _at_all_frames(used: NDArray[np.intp], scales: Floats, frames: int) -> Floats:
     """Return scales of the frames used, interpolated to all, mean logarithm 0, shape `(F,)`, read-only."""
-    logs = between(used, np.log(scales)[:, None], frames)[:, 0]
+    logs = between(used, np.log(scales), frames)
     found: Floats = np.exp(logs - logs.mean())
     read_only(found)
     return found

@@ -168,7 +168,7 @@ def to_all_frames(found: Learned, used: NDArray[np.intp], rotations: Floats) -> 
     turns = logarithm(found.rotations @ rotations[used].transpose(0, 2, 1))
     return Learned(
         exponential(between(used, turns, len(rotations))) @ rotations,
-        np.exp(between(used, np.log(found.scales)[:, None], len(rotations))[:, 0]),
+        np.exp(between(used, np.log(found.scales), len(rotations))),
         found.covariance.stretched(used, len(rotations)),
         found.energy,
     )
