@@ -144,7 +144,8 @@ def scratch(gram: Floats, projections: Floats, model_order: ModelOrder) -> Shape
     frames, factor, ordered = len(projections), factor_of(gram), model_order.ordered
     if ordered:
         seen = projections.transpose(0, 2, 1) @ factor.reshape(frames, 2, -1)
-        walk = WalkPosterior.of(projections, noise_variance=1.0, walk_variance=walk_bands(frames)[1] / START_SMOOTHNESS)
+        walk_variance = walk_bands(frames, ordered)[1] / START_SMOOTHNESS
+        walk = WalkPosterior.of(projections, noise_variance=1.0, walk_variance=walk_variance, ordered=ordered)
         shapes = walk.solve(seen)
     else:
         rigid = np.linalg.pinv(projections.reshape(-1, 3)) @ factor

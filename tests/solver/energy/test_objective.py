@@ -176,5 +176,5 @@ def test_single_precision_is_used_where_it_reaches_the_tolerance() -> None:
     assert inner_precision(given, 1e-6) == np.float64
     assert inner_precision(replace(given, weights=1e8 * given.weights), 0.1) == np.float64
     assert inner_precision(given.rounded(np.dtype(np.float32)), 1e-6) == np.float32
-    prior = PathPrior.of(walk_bands(4)[0], (np.ones((4, 1)),) * 3)
+    prior = PathPrior.of(walk_bands(4, ordered=True)[0], (np.ones((4, 1)),) * 3)
     assert inner_precision(replace(given, quadratic=prior), 0.1) == np.float64

@@ -24,7 +24,7 @@ def drawn(points: int, *, modes: int, drift: float, seed: int = 0) -> np.ndarray
     waves = np.stack([0.5 / (1 + k) * np.sin((k + 1) * np.pi * TIME + k) for k in range(modes)], axis=1)
     random = np.random.default_rng(seed)
     middle = random.standard_normal((points, 3)) * np.sqrt([0.2, 0.4, 0.6])
-    walk = np.linalg.cholesky(drift * random_walk(FRAMES))
+    walk = np.linalg.cholesky(drift * random_walk(FRAMES, ordered=True))
     deform = np.einsum("fk,pkc->fpc", waves, random.standard_normal((points, modes, 3)))
     deform += np.einsum("fg,pgc->fpc", walk, random.standard_normal((points, FRAMES, 3)))
     return np.einsum("fic,fpc->fpi", PAIRS, middle + deform) + 1e-4 * random.standard_normal((FRAMES, points, 2))

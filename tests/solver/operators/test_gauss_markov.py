@@ -29,7 +29,7 @@ def roots() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def prior(drift: float = 1e-3) -> PathPrior:
-    bands, norm = walk_bands(FRAMES)
+    bands, norm = walk_bands(FRAMES, ordered=True)
     return PathPrior.of(bands * norm / drift, roots())
 
 
@@ -45,7 +45,7 @@ def a_frame_s(weight: float) -> np.ndarray:
 
 
 def test_the_path_prior_is_the_inverse_of_the_covariance() -> None:
-    bands, norm = walk_bands(FRAMES)
+    bands, norm = walk_bands(FRAMES, ordered=True)
     chain = np.diag(bands[0]) + np.diag(bands[1, :-1], 1) + np.diag(bands[1, :-1], -1)
     for found, root in zip(dense_precisions(prior()), roots(), strict=True):
         covariance = 1e-3 * np.linalg.inv(chain) / norm + root @ root.T
