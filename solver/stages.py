@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 from pliant.solver.limits import learned_frames
 from pliant.solver.records import Floats
+from pliant.solver.tracks.frame_selection import longest_gaps
 
 UNIT_SECONDS, FRAME_SECONDS = 7e-5, 1.3e-5
 """Seconds per unit of work, and in addition per unit and frame, on one core: .2 ms at 10 frames, .46 at 30, .7 at 48, 1 at 74. The times
@@ -144,12 +144,7 @@ def planned(
 
 def unseen_frames(visible: Floats) -> float:
     """Return the longest run of frames in which a point is hidden, averaged over the points of `visible (F, P)`."""
-    current = np.zeros(visible.shape[1])
-    longest = current.copy()
-    for hidden in visible <= 0:
-        current = np.where(hidden, current + 1, 0.0)
-        np.maximum(longest, current, out=longest)
-    return float(longest.mean())
+    return float(longest_gaps(visible).mean())
 
 
 def learning(

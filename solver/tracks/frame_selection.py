@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.records import Floats
@@ -12,6 +14,15 @@ def informative_frames(visible: Floats) -> NDArray[np.bool_]:
     seen = (visible > 0).sum(axis=1)
     informative = np.asarray(seen >= max(3.0, 0.1 * float(np.median(seen[seen > 0]))))
     return informative if informative.sum() >= 3 else np.ones(len(seen), dtype=bool)
+
+
+def longest_gaps(visible: NDArray[np.floating[Any]]) -> NDArray[np.intp]:
+    """Return the length of the longest run of frames in which each point of `visible (F, P)` is hidden, shape `(P,)`."""
+    longest, gap = np.zeros(visible.shape[1], dtype=np.intp), np.zeros(visible.shape[1], dtype=np.intp)
+    for shown in visible > 0:
+        gap = np.where(shown, 0, gap + 1)
+        np.maximum(longest, gap, out=longest)
+    return longest
 
 
 def evenly_spread(total: int, count: int) -> NDArray[np.intp]:
