@@ -104,6 +104,11 @@ class Tracks:
         return bool((self.visible == 1).all())
 
 
+def mean_scale(scales: Floats) -> float:
+    """Return the geometric mean of positive scales `(F,)`."""
+    return float(np.exp(np.log(scales).mean()))
+
+
 def projections_of(rotations: Floats, scales: Floats) -> Floats:
     """Return s_f times the first two rows of R_f, shape `(F, 2, 3)`, of rotations `(F, 3, 3)` and scales `(F,)`."""
     return np.asarray(rotations[:, :2] * scales[:, None, None])

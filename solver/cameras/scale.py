@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from pliant.solver.cameras.factorization import upgrade
-from pliant.solver.records import Floats, projections_of
+from pliant.solver.records import Floats, mean_scale, projections_of
 from pliant.solver.settings import Settings
 
 SCALE_SHARE = 0.85
@@ -69,5 +69,5 @@ def rigid_scales(gram: Floats, rotations: Floats) -> Floats:
         scales = np.maximum(hit, 1e-3 * size) / np.maximum(size, np.finfo(float).tiny)
         typical = np.median(scales)  # a frame without visible points has no scale
         scales = np.clip(scales, 1e-2 * typical + 1e-12, 1e2 * typical + 1e-12)
-        scales = np.asarray(scales / np.exp(np.log(scales).mean()))
+        scales = np.asarray(scales / mean_scale(scales))
     return scales

@@ -173,7 +173,7 @@ def _with_shapes(
             monitor.expect([stage_of("observations", len(shown))], before="covariance")
         # The pose signs of a plane are weakly determined; completed outliers are enough to flip them.
         corrupted_plane = estimate.outliers > OUTLIER_SHARE and is_planar(estimate.gram)
-        scaled = observations.turning or (known is not None and known.scales is None)
+        scaled = observations.turning or (known is not None and observations.known_scales is None)
         scaled = scaled and settings.estimates_scales and not (known is None and corrupted_plane)
         estimate, data = refine_cameras(
             estimate, normalized, shown, turning=observations.turning and not corrupted_plane, estimates_scales=scaled,

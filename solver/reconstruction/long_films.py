@@ -21,7 +21,7 @@ from pliant.solver.model.so3 import angles_between, start_at_identity
 from pliant.solver.monitor import enter
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.reconstruction.observations import Observations
-from pliant.solver.records import Floats, projections_of, read_only
+from pliant.solver.records import Floats, mean_scale, projections_of, read_only
 from pliant.solver.refinement.covariance_learning import LearningData
 from pliant.solver.refinement.learned import Learned, Refinement
 from pliant.solver.tracks.completion import Filling, gross
@@ -58,15 +58,15 @@ def extended(
     frames = len(observations.normalized.points)
     turning = observations.turning
     scales, thin = estimate.scales, estimate.rotations
-    with_scales = bool((scales != 1).any()) and not _has_scales(observations)
+    with_scales = bool((scales != 1).any()) and observations.known_scales is None
     shapes = MeanShapes.of(covariance, thin, scales, estimate.sample)
     chosen = estimate.sampled
     views = _views(observations, estimate, chosen)
     poses = interpolated(used, thin, scales, covariance.modes, frames)
     if observations.known is not None:
         poses = replace(poses, rotations=np.array(observations.known.rotations))
-        if _has_scales(observations):
-            poses = replace(poses, scales=np.array(observations.known.scales))
+        if observations.known_scales is not None:
+            poses = replace(poses, scales=np.array(observations.known_scales))
     begun = poses.rotations
     poses = resected(views, shapes, poses, turning=turning, with_scales=with_scales, should_stop=should_stop)
     if turning:
@@ -74,13 +74,9 @@ def extended(
         start = Learned(poses.rotations, poses.scales, replace(covariance, modes=poses.coefficients), np.inf)
         how = Refinement(with_scales=with_scales, should_stop=should_stop)
         moved = how.refine_once(np.zeros((0, 0)), start, factor=columns(sample) / sample.shape[1] ** 0.5)
-        poses = replace(poses, rotations=moved.rotations, scales=moved.scales * np.exp(np.log(poses.scales).mean()))
+        poses = replace(poses, rotations=moved.rotations, scales=moved.scales * mean_scale(poses.scales))
         poses = resected(views, shapes, poses, turning=False, with_scales=False, should_stop=should_stop)
     return _whole(estimate, covariance, observations, views, shapes, poses, begun)
-
-
-def _has_scales(observations: Observations) -> bool:
-    return observations.known is not None and observations.known.scales is not None
 
 
 def _views(observations: Observations, estimate: CameraEstimate, chosen: NDArray[np.intp]) -> Views:
@@ -125,7 +121,7 @@ def _whole(
     begun: Floats,
 ) -> tuple[CameraEstimate, LearningData]:
     """Return the estimate of all frames, with an estimated first rotation set to the identity, and its covariance as learning data."""
-    size = 1.0 if _has_scales(observations) else float(np.exp(np.log(poses.scales).mean()))
+    size = mean_scale(poses.scales) if observations.known_scales is None else 1.0
     scales = poses.scales / size
     first = poses.rotations[0] if observations.known is None else np.eye(3)
     rotations = start_at_identity(poses.rotations) if observations.known is None else poses.rotations

@@ -13,7 +13,7 @@ import numpy as np
 from pliant.solver.evaluation.trust import assess_isometric
 from pliant.solver.isometry.surface import IsometricSurface, IsometricVerdict
 from pliant.solver.model.so3 import nearest
-from pliant.solver.records import Camera, Choices, Floats, Tracks
+from pliant.solver.records import Camera, Choices, Floats, Tracks, mean_scale
 from pliant.solver.settings import Settings
 from pliant.solver.solution import Outcome, Solution, Trace
 
@@ -74,7 +74,7 @@ def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera]:
     centred = surface.points - origin[:, None]
     rotations = _rotations(centred[:, surface.placed])
     scales = surface.focal / origin[:, 2]
-    unit = float(np.exp(np.log(scales).mean()))
+    unit = mean_scale(scales)
     shapes = unit * (centred @ rotations)
     point = np.array(surface.principal_point)
     translations = point + scales[:, None] * origin[:, :2]
