@@ -15,6 +15,8 @@ from pliant.solver.storage import allocated, let_go
 MIN_FRAMES = 3
 MIN_POINTS = 4
 
+Array = NDArray[np.floating]
+"""Numbers of either precision."""
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 

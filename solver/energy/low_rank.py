@@ -12,9 +12,8 @@ identity minus one term per mode above δ. It costs one eigenproblem of size F, 
 from __future__ import annotations
 
 import numpy as np
-from pliant.solver.energy.problem import Array
 from pliant.solver.operators.normal_equations import RankTerm
-from pliant.solver.records import Floats
+from pliant.solver.records import Array, Floats
 from scipy import linalg
 
 RANK_FLOOR = 1e-4

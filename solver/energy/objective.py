@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from pliant.solver.energy.low_rank import rank_penalty
-from pliant.solver.energy.problem import Array, Problem
+from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import loss_value, loss_weights
 from pliant.solver.operators.bending import bends_of, frames_together
 from pliant.solver.operators.normal_equations import rows_of
-from pliant.solver.records import Floats
+from pliant.solver.records import Array, Floats
 from pliant.solver.threads import SMALLEST, over_ranges
 
 

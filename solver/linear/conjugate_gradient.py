@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.pulse import ShouldStop, never, pulse
+from pliant.solver.records import Array
 from pliant.solver.threads import SMALLEST, over_ranges
-
-Array = NDArray[np.floating]
 
 
 class Linear(Protocol):

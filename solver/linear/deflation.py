@@ -17,10 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.operators.normal_equations import Operator
-from pliant.solver.records import Floats
+from pliant.solver.records import Array, Floats
 from pliant.solver.threads import over_ranges
-
-Array = NDArray[np.floating]
 
 MAX_FREE_MODES = 12
 """Maximum number of modes per coordinate; memory is quadratic in it."""

@@ -12,16 +12,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.linear import block_tridiagonal, multigrid, points
 from pliant.solver.linear.conjugate_gradient import Linear
 from pliant.solver.operators.normal_equations import Operator
 from pliant.solver.pulse import pulse
-from pliant.solver.records import Floats, Ints
+from pliant.solver.records import Array, Floats, Ints
 from pliant.solver.threads import available_cores, over_ranges
 from scipy import fft, linalg
 
-Array = NDArray[np.floating]
 MIN_POINTS_PER_THREAD = 1024
 """Minimum number of points per thread."""
 BENDS = 1.0

@@ -14,12 +14,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from pliant.solver.records import Floats
+from pliant.solver.records import Array, Floats
 from pliant.solver.threads import SMALLEST, over_ranges
 from scipy import linalg
-
-Array = NDArray[np.floating]
 
 POINT_BLOCK = 1024
 """Number of points per unit of parallel work."""

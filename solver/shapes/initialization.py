@@ -5,12 +5,12 @@ from __future__ import annotations
 from itertools import count
 
 import numpy as np
-from pliant.solver.energy.problem import Array, Problem
+from pliant.solver.energy.problem import Problem
 from pliant.solver.linear.conjugate_gradient import conjugate_gradient
 from pliant.solver.linear.preconditioner import build_preconditioner
 from pliant.solver.operators.normal_equations import Operator
 from pliant.solver.pulse import ShouldStop, never, pulse
-from pliant.solver.records import Floats
+from pliant.solver.records import Array, Floats
 from pliant.solver.shapes.irls import inner_precision
 
 EXACT, ROUGH, MAX_START_ITERATIONS = 1e-4, 0.1, 200

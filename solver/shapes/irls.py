@@ -11,14 +11,14 @@ from dataclasses import replace
 import numpy as np
 from pliant.solver.energy.low_rank import rank_term
 from pliant.solver.energy.objective import loss_of, prior, residuals_of, weights_of
-from pliant.solver.energy.problem import Array, Problem
+from pliant.solver.energy.problem import Problem
 from pliant.solver.errors import NotFinite
 from pliant.solver.linear import block_tridiagonal
 from pliant.solver.linear.conjugate_gradient import conjugate_gradient
 from pliant.solver.linear.preconditioner import build_preconditioner
 from pliant.solver.operators.normal_equations import Operator
 from pliant.solver.pulse import ShouldStop, never
-from pliant.solver.records import Floats
+from pliant.solver.records import Array, Floats
 from pliant.solver.shapes.state import State
 from pliant.solver.solution import Outcome
 from pliant.solver.threads import SMALLEST, over_ranges
