@@ -28,9 +28,6 @@ from pliant.solver.tracks.completion import Completed, Filling, complete
 from pliant.solver.tracks.frame_selection import every_nth, of_frames
 from pliant.solver.tracks.normalization import Normalized
 
-MIN_CAMERA_TURN = np.radians(10.0)
-"""Largest rotation relative to the first frame, rad, below which the result carries a warning."""
-
 MAX_HYPOTHESIS_GAP = 0.05
 """Maximum energy above the lowest after the first round at which the unrefined cameras of a factorization remain a hypothesis
 for the refinement with shapes: true cameras lie up to .05 above, false ones .10 and more. In that refinement another candidate
@@ -170,7 +167,7 @@ def estimate_cameras(
     reasons = {"basis_size": _why(ran, best, settings), "scales": scale_reason, "rotations": refined}
     return CameraEstimate(
         rotations, scales, completed.translations, best.basis_size, completed.gram, completed.sample,
-        hypotheses, completed.outliers, completed.rank, completed.filling, None, ordered, reasons, _warnings(rotations),
+        hypotheses, completed.outliers, completed.rank, completed.filling, None, ordered, reasons,
         candidates=candidates, sampled=completed.sampled,
     )  # fmt: skip
 
@@ -213,7 +210,6 @@ def with_other_cameras(estimate: CameraEstimate, other: OtherCameras) -> CameraE
         rotations=other.rotations,
         basis_size=other.basis_size,
         reasons={**estimate.reasons, "basis_size": why.strip()},
-        warnings=_warnings(other.rotations),
     )
 
 
@@ -312,10 +308,3 @@ def _why(ran: list[Candidate], best: Candidate, settings: Settings) -> str:
         f"{each.basis_size}{' with a smooth start' if each.smooth_start else ''}: {each.energy:.3f}" for each in ran
     )
     return f"K = {size} leads to the most probable motion of object and camera (negative log likelihood: {tried})."
-
-
-def _warnings(rotations: Floats) -> tuple[str, ...]:
-    directions = rotations[:, 2]  # in the object's axes; a roll about the viewing direction shows no depth
-    if np.linalg.norm(directions - directions[0], axis=1).max() >= 2 * np.sin(MIN_CAMERA_TURN / 2):
-        return ()
-    return ("The camera hardly turns around the object: the tracks do not determine depth. Treat it as a guess.",)

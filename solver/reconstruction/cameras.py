@@ -10,6 +10,7 @@ from pliant.solver.agreement import check_agreement, seen_again
 from pliant.solver.cameras import estimation
 from pliant.solver.cameras.estimation import CameraEstimate, given_cameras
 from pliant.solver.cameras.planar_ambiguity import is_planar
+from pliant.solver.evaluation.trust import turned
 from pliant.solver.limits import LEARNED_FRAMES, learned_stride
 from pliant.solver.model.expectation_maximisation import ModelOrder
 from pliant.solver.monitor import Monitor, enter
@@ -33,6 +34,9 @@ STAGES = (
     "completion", "multistart", "model_order", "starts", "perspective", "scales", "refinement", "observations",
     "covariance", "extension",
 )  # fmt: skip
+
+MIN_CAMERA_TURN = 10.0
+"""Largest angle between two viewing directions, degrees, below which the cameras carry a warning."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -127,10 +131,19 @@ def cameras_of(observations: Observations, monitor: Monitor) -> Cameras:
         assert data is not None
         estimate, covariance = learn_covariance(estimate, data, seed=settings.seed, should_stop=monitor)
         estimate, data = extended(estimate, covariance, used, observations, should_stop=monitor)
+    if observations.known is None:
+        estimate = replace(estimate, warnings=turn_warnings(estimate.rotations))
     return Cameras(
         camera_of(estimate, observations), estimate.outliers, estimate.reasons, estimate.warnings, monitor.stopped,
         estimate, data, observations,
     )  # fmt: skip
+
+
+def turn_warnings(rotations: Floats) -> tuple[str, ...]:
+    """Return a warning if estimated rotations `(F, 3, 3)` hardly differ; a roll about the viewing direction shows no depth."""
+    if turned(rotations) >= MIN_CAMERA_TURN:
+        return ()
+    return ("The camera hardly turns around the object: the tracks do not determine depth. Treat it as a guess.",)
 
 
 def _without_outliers(
