@@ -322,7 +322,7 @@ class Choices:
     low_rank_weight: float
     """λ3, dimensionless."""
     laplacian: str
-    """Laplacian used: `grid8`, `uniform` or `cotangent`."""
+    """Laplacian used: `grid8`, `uniform`, `cotangent` or `none`."""
     unit: float
     """RMS radius of the centred tracks, the tracks' unit: one normalized unit."""
     noise: float

@@ -38,25 +38,6 @@ SURFACE_SECONDS, SURFACE_SETUP = 0.45, 40
 """Search for an isometric surface: seconds per frame, on at most 24 frames, and duration of its preparation in units of work. Measured for
 paper, a comic page and a shallow face."""
 
-
-@dataclass(frozen=True, slots=True)
-class Stage:
-    """A stage of a solve."""
-
-    name: str
-    seconds: float
-    """Expected duration."""
-
-    units: int
-    """Expected units of work."""
-
-    growth: float = 1.0
-    """Ratio of the times of consecutive units."""
-
-    setup: int = 0
-    """Duration of the preparation before the first unit, in units."""
-
-
 COMPLETION_SECONDS, MOST_COMPLETED, RANK_GROWTH = 8e-7, (60, 600), 2.0
 """Completion of hidden positions: seconds per squared frame count and point; the numbers of frames and of points above which the time no
 longer grows, because the ranks tried end at 40; and the ratio of the times of consecutive ranks."""
@@ -93,6 +74,24 @@ Measured for 30, 60 and 99 frames."""
 
 UNITS_PER_START = 195
 """Units per starting point of the stage `starts`, averaged over eleven, including the second refinement of the best."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A stage of a solve."""
+
+    name: str
+    seconds: float
+    """Expected duration."""
+
+    units: int
+    """Expected units of work."""
+
+    growth: float = 1.0
+    """Ratio of the times of consecutive units."""
+
+    setup: int = 0
+    """Duration of the preparation before the first unit, in units."""
 
 
 def planned(

@@ -116,7 +116,7 @@ class Perspective:
     """The same of all sampled points, shape `(F, S, 2)`."""
 
     depth: Floats | DepthMap = field(default_factory=lambda: np.zeros((0, 0)))
-    """D of the latest cameras and covariance, shape `(F, 2F)`."""
+    """D of the latest cameras and covariance, shape `(F, 2F)`, or in factored form in long films."""
 
     @property
     def bends(self) -> bool:

@@ -32,6 +32,9 @@ UNLIKE = 0.1
 ENOUGH = 0.002
 """Share of deviating weights below which no correction is built."""
 
+MODE_BLOCK = 256
+"""Number of points inverted together."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coarse:
@@ -96,10 +99,6 @@ def build_coarse(operator: Operator, stiffness: Floats) -> Coarse | None:
 
     over_ranges(work, len(points), smallest=MODE_BLOCK)
     return Coarse(modes, points, inverses)
-
-
-MODE_BLOCK = 256
-"""Number of points inverted together."""
 
 
 def _free_modes(operator: Operator, limit: float) -> tuple[tuple[Floats, Floats, Floats], list[Floats]]:

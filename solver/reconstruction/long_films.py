@@ -148,7 +148,7 @@ def _whole(
     )  # fmt: skip
     data = LearningData(
         np.zeros((0, 0)), sample, projections_of(rotations, scales), np.arange(len(rotations)),
-        ModelOrder(ordered=covariance.ordered), stopped=whole,
+        ModelOrder(ordered=covariance.ordered), covariance=whole,
         rotations=rotations, scales=scales, turned=False,
     )  # fmt: skip
     return estimate, data

@@ -34,8 +34,8 @@ class LearningData:
 
     model_order: ModelOrder
 
-    stopped: ShapeCovariance | None
-    """Covariance of an interrupted refinement, used unchanged; None to learn one."""
+    covariance: ShapeCovariance | None
+    """Already learned, with an interrupted refinement or the cameras of a long film; None to learn one."""
 
     rotations: Floats
     """Cameras of all frames in the axes of `projections`, shape `(F, 3, 3)`."""
@@ -63,8 +63,8 @@ def learn_covariance(
     should_stop : callable, optional
         Called between rounds of EM; once it returns True, the best covariance so far is returned.
     """
-    if data.stopped is not None:
-        covariance, modes = data.stopped, described(data.stopped)
+    if data.covariance is not None:
+        covariance, modes = data.covariance, described(data.covariance)
     else:
         # Learn from scratch: modes learned along the way to these cameras overstate their likelihood.
         enter(should_stop, "covariance")

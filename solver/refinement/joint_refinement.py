@@ -98,7 +98,7 @@ def refine_cameras(
         estimate, rotations, found = _mirrored(estimate, rotations, found)
     return estimate, LearningData(
         evidence.gram, evidence.sample, found.projections, evidence.used, model_order,
-        stopped=None if np.isfinite(found.energy) else found.covariance,
+        covariance=None if np.isfinite(found.energy) else found.covariance,
         rotations=rotations, scales=estimate.scales, turned=True,
     )  # fmt: skip
 
@@ -115,7 +115,7 @@ def _with_kept_rotations(
         evidence, _ = _of_observations(evidence, found, how)
     estimate = evidence.estimate
     return estimate, LearningData(
-        evidence.gram, evidence.sample, evidence.projections, evidence.used, how.model_order, stopped=None,
+        evidence.gram, evidence.sample, evidence.projections, evidence.used, how.model_order, covariance=None,
         rotations=estimate.rotations, scales=estimate.scales, turned=False,
     )  # fmt: skip
 
