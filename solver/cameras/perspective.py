@@ -195,12 +195,7 @@ def density(depths: Floats, curvature: float) -> float:
 
 def mirrored(rotations: Floats, covariance: ShapeCovariance) -> tuple[Floats, ShapeCovariance]:
     """Return cameras and covariance with all depths reversed; orthographic images do not change."""
-    turned = replace(
-        covariance,
-        mean_covariance=MIRROR @ covariance.mean_covariance @ MIRROR,
-        axis_covariance=MIRROR @ covariance.axis_covariance @ MIRROR,
-    )
-    return MIRROR @ rotations @ MIRROR, turned
+    return MIRROR @ rotations @ MIRROR, covariance.turned(MIRROR)
 
 
 def corrected_moments(view: Perspective, normalized: Normalized) -> tuple[Floats, Floats, Floats]:

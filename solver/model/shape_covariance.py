@@ -122,6 +122,14 @@ class ShapeCovariance:
         )
         return basis, PathPrior.of(chain * (norm / self.walk_variance), (first, second, third))
 
+    def turned(self, axes: Floats) -> ShapeCovariance:
+        """Return the covariance of the coordinates `axes` x, for a 3×3 matrix: a rotation, a reflection or a stretch."""
+        return replace(
+            self,
+            mean_covariance=axes @ self.mean_covariance @ axes.T,
+            axis_covariance=axes @ self.axis_covariance @ axes.T,
+        )
+
     def stretched(self, used: NDArray[np.intp], num_frames: int) -> ShapeCovariance:
         """Return the covariance of all `num_frames` frames when this one covers the frames `used`.
 

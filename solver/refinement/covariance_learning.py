@@ -76,13 +76,4 @@ def learn_covariance(
     estimate = with_depth_map(
         replace(estimate, reasons={**estimate.reasons, "modes": modes}), covariance, data.rotations, data.scales
     )
-    return estimate, _seen_from(covariance, data.rotations[0]) if data.turned else covariance
-
-
-def _seen_from(covariance: ShapeCovariance, first: Floats) -> ShapeCovariance:
-    """Return the covariance in the axes of the first camera."""
-    return replace(
-        covariance,
-        mean_covariance=first @ covariance.mean_covariance @ first.T,
-        axis_covariance=first @ covariance.axis_covariance @ first.T,
-    )
+    return estimate, covariance.turned(data.rotations[0]) if data.turned else covariance
