@@ -12,36 +12,12 @@ from pliant.solver.records import Array, Floats
 from pliant.solver.threads import SMALLEST, over_ranges
 
 
-def residuals(problem: Problem, shapes: Array, translations: Floats) -> Array:
-    """Return w − s R x − t, shape `(F, 2, P)`, normalized units; undefined where hidden."""
-    left = np.empty_like(problem.points, dtype=shapes.dtype)
-
-    def work(start: int, stop: int) -> None:
-        for frame in range(start, stop):
-            left[frame] = residuals_of(problem, shapes, translations, frame)
-
-    over_ranges(work, len(shapes), smallest=max(1, SMALLEST // shapes[0].size))
-    return left
-
-
 def residuals_of(problem: Problem, shapes: Array, translations: Floats, frame: int) -> Array:
     """Return the residuals of one frame, shape `(2, P)`."""
     image: Array = np.matmul(problem.projections[frame], shapes[frame])
     image += translations[frame][:, None].astype(shapes.dtype)
     np.subtract(problem.points[frame], image, out=image)
     return image
-
-
-def objective(problem: Problem, shapes: Array, residual: Array) -> float:
-    """Return E = Σ v ρ(r) + λ1 ‖HX‖² + λ2 ‖AX‖² (Dai, Deng, He 2017, eq. 7) + rank penalty."""
-    parts = np.zeros(len(shapes))
-
-    def work(start: int, stop: int) -> None:
-        for frame in range(start, stop):
-            parts[frame] = loss_of(problem, residual[frame], frame)
-
-    over_ranges(work, len(shapes), smallest=max(1, SMALLEST // shapes[0].size))
-    return float(parts.sum()) + prior(problem, shapes)
 
 
 def loss_of(problem: Problem, residual: Array, frame: int) -> float:
@@ -63,7 +39,7 @@ def prior(problem: Problem, shapes: Array) -> float:
 
 
 def smoothness(problem: Problem, shapes: Array) -> float:
-    """Return λ1 ‖HX‖² + λ2 ‖AX‖²; with a Gaussian prior the first term is λ1 tr XᵀQX."""
+    """Return λ1 ‖HX‖² + λ2 ‖AX‖² (Dai, Deng, He 2017, eq. 7); with a Gaussian prior the first term is λ1 tr XᵀQX."""
     weights = problem.weights
     total = 0.0 if problem.quadratic is None else problem.quadratic.value(shapes)
     temporal = weights.temporal if problem.quadratic is None else 0.0
