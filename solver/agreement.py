@@ -145,8 +145,7 @@ def _check_cameras(tracks: Tracks, cameras: KnownCamera, settings: Settings) -> 
             got="'orthographic'", hint="Orthographic cameras have scale 1. Choose another model, or leave the scales out.",
         )  # fmt: skip
     given = settings.focal_length
-    orthographic = settings.camera in ("orthographic", "scaled_orthographic")
-    if cameras.focal is not None and (orthographic or given not in (None, cameras.focal)):
+    if cameras.focal is not None and (settings.is_orthographic or given not in (None, cameras.focal)):
         raise InvalidInput(
             "camera_mismatch", field="cameras.focal", expected=f"no focal length with camera {settings.camera} and focal {given}",
             got=f"{cameras.focal}", hint="Give the focal length once, with camera perspective or auto.",

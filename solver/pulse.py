@@ -1,4 +1,4 @@
-"""Progress reports from inside long units of work.
+"""Progress reports from inside long units of work, and requests to stop them.
 
 Linear algebra calls `pulse()` between steps, so that the monitor of the solve can report again if it has been silent. The receiver is a
 context variable, like the limit of `threads`, because passing it through the linear algebra would add a parameter to every function.
@@ -11,7 +11,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
+ShouldStop = Callable[[], bool]
+"""Called between units of work: counts them, and returns True to stop."""
+
 _RECEIVER: ContextVar[Callable[[], None] | None] = ContextVar("pulse", default=None)
+
+
+def never() -> bool:
+    """Return False: work that nobody asks to stop."""
+    return False
 
 
 @contextmanager

@@ -17,9 +17,9 @@ from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.blocks import needs_blocks
-from pliant.solver.reconstruction.cameras import Cameras, cameras_of
-from pliant.solver.reconstruction.observations import Observations, monitored, observe
-from pliant.solver.reconstruction.prior import Prior, prior_of
+from pliant.solver.reconstruction.cameras import cameras_of
+from pliant.solver.reconstruction.observations import monitored, observe
+from pliant.solver.reconstruction.prior import prior_of
 from pliant.solver.reconstruction.solve_shapes import shapes_of
 from pliant.solver.reconstruction.surface import isometric_verdict, solution_of, tries_isometry, with_verdict
 from pliant.solver.records import KnownCamera, Step, Tracks
@@ -101,7 +101,8 @@ def _solved(
     verdict = isometric_verdict(tracks, known, settings, monitor)
     if verdict is not None and verdict.surface is not None and not verdict.weak:
         return solution_of(tracks, verdict, settings, monitor, began=began)
-    cameras, prior = _learned(observations, monitor)
+    cameras = cameras_of(observations, monitor)
+    prior = prior_of(cameras, monitor, seed=settings.seed) if settings.gaussian else None
     monitor.report(Step("cameras", 0.0, max_reweightings=settings.max_reweightings))
     learning = time.perf_counter() - began
     if needs_blocks(tracks, settings):  # which take their points from the tracks
@@ -110,9 +111,3 @@ def _solved(
         tracks, cameras, prior, mesh, settings, monitor, seconds={"cameras": learning}, scratch=scratch
     )
     return solution if verdict is None else with_verdict(solution, tracks, verdict, settings, monitor, began=began)
-
-
-def _learned(observations: Observations, monitor: Monitor) -> tuple[Cameras, Prior | None]:
-    cameras = cameras_of(observations, monitor)
-    settings = observations.settings
-    return cameras, prior_of(cameras, monitor, seed=settings.seed) if settings.gaussian else None

@@ -15,6 +15,8 @@ from pliant.solver.storage import allocated, let_go
 MIN_FRAMES = 3
 MIN_POINTS = 4
 
+Array = NDArray[np.floating]
+"""Numbers of either precision."""
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
@@ -109,6 +111,16 @@ class Tracks:
     def all_visible(self) -> bool:
         """Whether every observation has confidence 1."""
         return bool((self.visible == 1).all())
+
+
+def mean_scale(scales: Floats) -> float:
+    """Return the geometric mean of positive scales `(F,)`."""
+    return float(np.exp(np.log(scales).mean()))
+
+
+def projections_of(rotations: Floats, scales: Floats) -> Floats:
+    """Return s_f times the first two rows of R_f, shape `(F, 2, 3)`, of rotations `(F, 3, 3)` and scales `(F,)`."""
+    return np.asarray(rotations[:, :2] * scales[:, None, None])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -318,7 +330,7 @@ class Choices:
     low_rank_weight: float
     """λ3, dimensionless."""
     laplacian: str
-    """Laplacian used: `grid8`, `uniform` or `cotangent`."""
+    """Laplacian used: `grid8`, `uniform`, `cotangent` or `none`."""
     unit: float
     """RMS radius of the centred tracks, the tracks' unit: one normalized unit."""
     noise: float

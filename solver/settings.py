@@ -138,6 +138,11 @@ class Settings:
         return self.prior == "gaussian" and self.method == "robust" and self.preset == "auto"
 
     @property
+    def is_orthographic(self) -> bool:
+        """Whether the camera model has no perspective."""
+        return self.camera in ("orthographic", "scaled_orthographic")
+
+    @property
     def estimates_scales(self) -> bool:
         """Whether every frame may have its own scale."""
         return self.camera != "orthographic"
@@ -177,7 +182,7 @@ class Settings:
                 "order", "prior gaussian with method robust and preset auto beside order any",
                 f"prior {self.prior}, method {self.method}, preset {self.preset}", "The other priors compare neighbouring frames.",
             )  # fmt: skip
-        if self.surface == "isometric" and self.camera in ("orthographic", "scaled_orthographic"):
+        if self.surface == "isometric" and self.is_orthographic:
             raise _contradiction(
                 "surface", f"auto or free beside camera {self.camera}", "'isometric'",
                 "An isometric surface is found from its perspective. Leave out one of the two.",
@@ -243,7 +248,7 @@ def check_pinhole(settings: Settings) -> None:
         raise _contradiction(
             "field_of_view", "image_size beside field_of_view", "no image_size", "Give the picture's width and height."
         )
-    if (focal is not None or angle is not None) and settings.camera in ("orthographic", "scaled_orthographic"):
+    if (focal is not None or angle is not None) and settings.is_orthographic:
         given = "focal" if focal is not None else "field_of_view"
         raise _contradiction(
             given, f"no focal length with camera {settings.camera}", f"{given} = {focal or angle}",

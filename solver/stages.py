@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 from pliant.solver.limits import learned_frames
 from pliant.solver.records import Floats
+from pliant.solver.tracks.frame_selection import longest_gaps
 
 UNIT_SECONDS, FRAME_SECONDS = 7e-5, 1.3e-5
 """Seconds per unit of work, and in addition per unit and frame, on one core: .2 ms at 10 frames, .46 at 30, .7 at 48, 1 at 74. The times
@@ -37,25 +37,6 @@ FINISH_SECONDS = 3e-7
 SURFACE_SECONDS, SURFACE_SETUP = 0.45, 40
 """Search for an isometric surface: seconds per frame, on at most 24 frames, and duration of its preparation in units of work. Measured for
 paper, a comic page and a shallow face."""
-
-
-@dataclass(frozen=True, slots=True)
-class Stage:
-    """A stage of a solve."""
-
-    name: str
-    seconds: float
-    """Expected duration."""
-
-    units: int
-    """Expected units of work."""
-
-    growth: float = 1.0
-    """Ratio of the times of consecutive units."""
-
-    setup: int = 0
-    """Duration of the preparation before the first unit, in units."""
-
 
 COMPLETION_SECONDS, MOST_COMPLETED, RANK_GROWTH = 8e-7, (60, 600), 2.0
 """Completion of hidden positions: seconds per squared frame count and point; the numbers of frames and of points above which the time no
@@ -93,6 +74,24 @@ Measured for 30, 60 and 99 frames."""
 
 UNITS_PER_START = 195
 """Units per starting point of the stage `starts`, averaged over eleven, including the second refinement of the best."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A stage of a solve."""
+
+    name: str
+    seconds: float
+    """Expected duration."""
+
+    units: int
+    """Expected units of work."""
+
+    growth: float = 1.0
+    """Ratio of the times of consecutive units."""
+
+    setup: int = 0
+    """Duration of the preparation before the first unit, in units."""
 
 
 def planned(
@@ -144,12 +143,7 @@ def planned(
 
 def unseen_frames(visible: Floats) -> float:
     """Return the longest run of frames in which a point is hidden, averaged over the points of `visible (F, P)`."""
-    current = np.zeros(visible.shape[1])
-    longest = current.copy()
-    for hidden in visible <= 0:
-        current = np.where(hidden, current + 1, 0.0)
-        np.maximum(longest, current, out=longest)
-    return float(longest.mean())
+    return float(longest_gaps(visible).mean())
 
 
 def learning(

@@ -59,7 +59,7 @@ def move_to_expected(chained: Chain, should_stop: Callable[[], bool]) -> None:
         part = slice(start, start + POINTS_AT_ONCE)
         points = (chained.points[:, part] - centre) / sample.unit
         relative = weight[:, part].astype(np.float64) / sample.full_confidence
-        coefficients, _ = coefficients_of(points, relative, basis, spread, scale, sweeps=4, with_moment=False)
+        coefficients, _ = coefficients_of(points, relative, basis, spread, scale, sweeps=4)
         chained.points[:, part] = predict(basis, coefficients) * sample.unit + centre
 
 

@@ -20,9 +20,10 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from pliant.solver import Mesh, Settings, Solution, Tracks, solve
-from pliant.solver.evaluation.alignment import align, frobenius, procrustes
+from pliant.solver.evaluation.alignment import align, frobenius
 from pliant.solver.evaluation.metrics import e3d_sequence
 from pliant.solver.gallery import corrupt_tracks
+from pliant.solver.model.so3 import nearest
 
 from benchmarks.accuracy.cells import parse_settings
 from benchmarks.figures.shading import draw_mesh, draw_points
@@ -92,7 +93,7 @@ def scene_of(case: Case, solution: Solution, *, fixed: bool, side: float) -> Sce
     whole = ours if truth is None else truth
     radius = size * frobenius(whole) / np.sqrt(whole.shape[1])
     if fixed:
-        turns = np.broadcast_to(procrustes(turns.sum(axis=0), proper=True), turns.shape)
+        turns = np.broadcast_to(nearest(turns.sum(axis=0)), turns.shape)
     flip = np.diag([1.0, -1.0, -1.0]) if case.y_up else np.eye(3)
     views = (_turn(side) @ flip @ turns).transpose(0, 2, 1)
     return Scene(ours @ views, None if truth is None else truth @ views, error / radius[:, None], quantity, relative)

@@ -17,10 +17,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from pliant.solver.energy.objective import objective, residuals
+from pliant.solver.energy.objective import loss_of, prior, residuals_of
 from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import loss_weights
-from pliant.solver.operators.finite_differences import differences
+from pliant.solver.threads import SMALLEST, over_ranges
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
@@ -100,7 +100,7 @@ def normal_matrix(problem: Problem) -> sparse.csr_array:
     """Assemble λ1 HᵀH ⊗ I + λ2 I ⊗ AᵀA, for unknowns in the order frame, coordinate, point."""
     frames, _, points = problem.points.shape
     order, weights = len(problem.bands) - 1, problem.weights
-    steps = sparse.csr_array(differences(np.eye(frames), order))
+    steps = sparse.csr_array(np.diff(np.eye(frames), n=order, axis=0))
     matrix = sparse.csr_array(
         weights.temporal * sparse.kron(steps.T @ steps, sparse.eye_array(3 * points), format="csr")
     )
@@ -142,7 +142,7 @@ def _reweight(
     fixed = normal_matrix(problem)
     points = problem.points - translations[:, :, None]
     while run.seconds == [] or run.seconds[-1] < cap:
-        left = residuals(problem, shapes, translations)
+        left = _residuals(problem, shapes, translations)
         omega = loss_weights(left, problem.confidence, loss=problem.loss, scale=problem.weights.robust_scale)
         right = np.matmul(problem.projections.transpose(0, 2, 1), omega * points).ravel()
         solved = inner(fixed, data_matrix(problem, omega), right, shapes.ravel(), run, began)
@@ -181,7 +181,7 @@ def _scipy_cg(reduction: float, cap: float) -> Inner:
 def _smoothness_gradient(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
     frames, _, points = problem.points.shape
     order, weights = len(problem.bands) - 1, problem.weights
-    steps = differences(np.eye(frames), order)
+    steps = np.diff(np.eye(frames), n=order, axis=0)
     temporal = sparse.csr_array(weights.temporal * (steps.T @ steps))
     spatial = None
     if problem.laplacian is not None and weights.spatial > 0:
@@ -198,4 +198,28 @@ def _smoothness_gradient(problem: Problem) -> Callable[[np.ndarray], np.ndarray]
 
 
 def _energy(problem: Problem, shapes: np.ndarray, translations: np.ndarray) -> float:
-    return objective(problem, shapes, residuals(problem, shapes, translations))
+    return _objective(problem, shapes, _residuals(problem, shapes, translations))
+
+
+def _residuals(problem: Problem, shapes: np.ndarray, translations: np.ndarray) -> np.ndarray:
+    """Return w − s R x − t, shape `(F, 2, P)`, normalized units; undefined where hidden."""
+    left = np.empty_like(problem.points, dtype=shapes.dtype)
+
+    def work(start: int, stop: int) -> None:
+        for frame in range(start, stop):
+            left[frame] = residuals_of(problem, shapes, translations, frame)
+
+    over_ranges(work, len(shapes), smallest=max(1, SMALLEST // shapes[0].size))
+    return left
+
+
+def _objective(problem: Problem, shapes: np.ndarray, residual: np.ndarray) -> float:
+    """Return E = Σ v ρ(r) + λ1 ‖HX‖² + λ2 ‖AX‖² (Dai, Deng, He 2017, eq. 7) + rank penalty."""
+    parts = np.zeros(len(shapes))
+
+    def work(start: int, stop: int) -> None:
+        for frame in range(start, stop):
+            parts[frame] = loss_of(problem, residual[frame], frame)
+
+    over_ranges(work, len(shapes), smallest=max(1, SMALLEST // shapes[0].size))
+    return float(parts.sum()) + prior(problem, shapes)

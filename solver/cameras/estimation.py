@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,14 +21,12 @@ from pliant.solver.cameras.planar_ambiguity import is_planar, resolve_pose_signs
 from pliant.solver.cameras.scale import rigid_evidence, rigid_scales
 from pliant.solver.model.so3 import angles_between, start_at_identity
 from pliant.solver.monitor import enter
-from pliant.solver.records import Floats, KnownCamera, read_only
+from pliant.solver.pulse import ShouldStop, never
+from pliant.solver.records import Floats, KnownCamera, projections_of, read_only
 from pliant.solver.settings import Settings
 from pliant.solver.tracks.completion import Completed, Filling, complete
 from pliant.solver.tracks.frame_selection import every_nth, of_frames
 from pliant.solver.tracks.normalization import Normalized
-
-MIN_CAMERA_TURN = np.radians(10.0)
-"""Largest rotation relative to the first frame, rad, below which the result carries a warning."""
 
 MAX_HYPOTHESIS_GAP = 0.05
 """Maximum energy above the lowest after the first round at which the unrefined cameras of a factorization remain a hypothesis
@@ -113,12 +110,17 @@ class CameraEstimate:
     depth_is_typical: bool = False
     """Whether the prior, not the tracks, determines the extent of depth (`refinement.bas_relief`)."""
 
+    @property
+    def projections(self) -> Floats:
+        """Shape `(F, 2, 3)`, see `projections_of`."""
+        return projections_of(self.rotations, self.scales)
+
 
 def estimate_cameras(
     normalized: Normalized,
     settings: Settings,
     *,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
     rank: int = 0,
 ) -> CameraEstimate:
     """Estimate the cameras from the tracks, without a model of the shapes.
@@ -165,7 +167,7 @@ def estimate_cameras(
     reasons = {"basis_size": _why(ran, best, settings), "scales": scale_reason, "rotations": refined}
     return CameraEstimate(
         rotations, scales, completed.translations, best.basis_size, completed.gram, completed.sample,
-        hypotheses, completed.outliers, completed.rank, completed.filling, None, ordered, reasons, _warnings(rotations),
+        hypotheses, completed.outliers, completed.rank, completed.filling, None, ordered, reasons,
         candidates=candidates, sampled=completed.sampled,
     )  # fmt: skip
 
@@ -177,16 +179,24 @@ def _factorized(
     sizes: list[int],
     *,
     ordered: bool,
-    should_stop: Callable[[], bool] | None,
+    should_stop: ShouldStop,
 ) -> tuple[list[Upgrade], list[Candidate]]:
     """Return the factorization for every K of `sizes`, and from each a multistart candidate at the frames used."""
     factorized: list[Upgrade] = []
     entries: list[Candidate] = []
     for each in upgrades(gram, sizes):
         factorized.append(each)
-        thinned = Upgrade(each.basis_size, each.rotations[used], each.scales[used], each.residual)
-        entries.append(with_fixed_rotations(part, thinned, ordered=ordered, should_stop=should_stop))
-        if should_stop is not None and should_stop():
+        entries.append(
+            with_fixed_rotations(
+                part,
+                each.rotations[used],
+                each.basis_size,
+                smooth_start=False,
+                ordered=ordered,
+                should_stop=should_stop,
+            )
+        )
+        if should_stop():
             break
     return factorized, entries
 
@@ -200,7 +210,6 @@ def with_other_cameras(estimate: CameraEstimate, other: OtherCameras) -> CameraE
         rotations=other.rotations,
         basis_size=other.basis_size,
         reasons={**estimate.reasons, "basis_size": why.strip()},
-        warnings=_warnings(other.rotations),
     )
 
 
@@ -241,7 +250,7 @@ def given_cameras(
     *,
     rank: int = 0,
     perspective: bool = False,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> CameraEstimate:
     """Return given cameras as an estimate; missing scales are estimated if the camera model has them.
 
@@ -299,10 +308,3 @@ def _why(ran: list[Candidate], best: Candidate, settings: Settings) -> str:
         f"{each.basis_size}{' with a smooth start' if each.smooth_start else ''}: {each.energy:.3f}" for each in ran
     )
     return f"K = {size} leads to the most probable motion of object and camera (negative log likelihood: {tried})."
-
-
-def _warnings(rotations: Floats) -> tuple[str, ...]:
-    directions = rotations[:, 2]  # in the object's axes; a roll about the viewing direction shows no depth
-    if np.linalg.norm(directions - directions[0], axis=1).max() >= 2 * np.sin(MIN_CAMERA_TURN / 2):
-        return ()
-    return ("The camera hardly turns around the object: the tracks do not determine depth. Treat it as a guess.",)

@@ -44,12 +44,6 @@ class Upgrade:
     rotations: Floats
     """Shape `(F, 3, 3)`; the first is the identity."""
 
-    scales: Floats
-    """|c_f|, shape `(F,)`, mean logarithm 0; equals the camera's scale if the first basis shape is constant."""
-
-    residual: float
-    """Root mean square deviation of c_f R_f from orthogonal rows of equal length, relative to c_f²."""
-
 
 def upgrade(gram: Floats, basis_size: int) -> Upgrade:
     """Return the cameras of a rank-3K factorization of the tracks.
@@ -75,11 +69,7 @@ def _upgraded(factor: Floats, basis_size: int) -> Upgrade:
     if basis_size == 1:  # Q is unique: columns of equal length keep the trace term from shrinking a small rotation
         factor = factor / np.maximum(np.sqrt((factor**2).mean(axis=(0, 1))), 1e-6)
     corrective = refine_factor(factor, least_trace_factor(factor, 0.0 if basis_size == 1 else TRACE_WEIGHT))
-    rows = continue_signs(factor @ corrective)
-    lengths = np.sqrt(np.maximum((rows**2).sum(axis=(1, 2)) / 2, np.finfo(float).tiny))
-    scales = np.exp(np.log(lengths) - np.log(lengths).mean())
-    residual = float(np.sqrt(_orthonormality(corrective.ravel(), factor)[0]))
-    return Upgrade(basis_size, start_at_identity(from_rows(rows)), scales, residual)
+    return Upgrade(basis_size, start_at_identity(from_rows(continue_signs(factor @ corrective))))
 
 
 def leading_factor(gram: Floats, rank: int) -> Floats:

@@ -26,7 +26,7 @@ def given_lens(normalized: Normalized, settings: Settings, cameras: KnownCamera 
         given = cameras.focal
     if cameras is not None and cameras.principal_point is not None:
         centre = cameras.principal_point
-    if settings.camera in ("orthographic", "scaled_orthographic"):
+    if settings.is_orthographic:
         return None
     if settings.camera == "auto" and given is None and not settings.gaussian:
         return None

@@ -11,14 +11,13 @@ Long sequences use every n-th frame; the correction found is interpolated to the
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.factorization import Upgrade
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, Motion, Scene, cameras_of, fit, start
 from pliant.solver.model.so3 import exponential, logarithm, nearest
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.tracks.frame_selection import between
 from pliant.solver.tracks.noise import white_noise
@@ -75,19 +74,27 @@ class Candidate:
 
 def with_fixed_rotations(
     gram: Floats,
-    upgrade: Upgrade,
+    rotations: Floats,
+    basis_size: int,
     *,
-    ordered: bool = True,
-    should_stop: Callable[[], bool] | None = None,
+    smooth_start: bool,
+    ordered: bool,
+    should_stop: ShouldStop,
 ) -> Candidate:
-    """Return the cameras of a factorization, and their energy with the rotations fixed and every scale 1."""
-    return _entered(
-        gram, upgrade.rotations, upgrade.basis_size, smooth_start=False, ordered=ordered, should_stop=should_stop
+    """Return cameras, such as those of a factorization, and their energy with the rotations fixed and every scale 1."""
+    scene = Scene.of(gram, rotations, with_scales=False, prior_weight=scaled_prior_weight(gram), ordered=ordered)
+    motion, energy = fit(
+        scene,
+        start(scene, np.ones(len(rotations))),
+        iterations=FIXED_ROTATION_ITERATIONS,
+        turning=False,
+        should_stop=should_stop,
     )
+    return Candidate(basis_size, smooth_start, scene, motion, energy)
 
 
 def run_multistart(
-    gram: Floats, entries: list[Candidate], *, ordered: bool = True, should_stop: Callable[[], bool] | None = None
+    gram: Floats, entries: list[Candidate], *, ordered: bool = True, should_stop: ShouldStop = never
 ) -> tuple[Candidate, list[Candidate]]:
     """Return the best candidate, refined, and all candidates after the first round.
 
@@ -112,14 +119,14 @@ def run_multistart(
     for iterations, left in MULTISTART_ROUNDS:
         finished: list[Candidate] = []
         for candidate in running:
-            stopped = should_stop is not None and should_stop()
+            stopped = should_stop()
             finished.append(candidate if stopped else refined(candidate, iterations, should_stop=should_stop))
         first = first or finished
         running = sorted(finished, key=rating)[:left]
     return running[0], first
 
 
-def refined(candidate: Candidate, iterations: int, *, should_stop: Callable[[], bool] | None = None) -> Candidate:
+def refined(candidate: Candidate, iterations: int, *, should_stop: ShouldStop = never) -> Candidate:
     """Return the candidate after `iterations` L-BFGS iterations with free rotations."""
     motion, energy = fit(
         candidate.scene, candidate.motion, iterations=iterations, turning=True, should_stop=should_stop
@@ -127,7 +134,7 @@ def refined(candidate: Candidate, iterations: int, *, should_stop: Callable[[], 
     return Candidate(candidate.basis_size, candidate.smooth_start, candidate.scene, motion, energy)
 
 
-def smooth_start(gram: Floats, candidate: Candidate, *, should_stop: Callable[[], bool] | None = None) -> Candidate:
+def smooth_start(gram: Floats, candidate: Candidate, *, should_stop: ShouldStop = never) -> Candidate:
     """Return a candidate with smooth camera motion near the given one.
 
     The factorization of a body that deforms as fast as it rotates gives jittering cameras near a local minimum of the
@@ -145,7 +152,9 @@ def smooth_start(gram: Floats, candidate: Candidate, *, should_stop: Callable[[]
         calm, start(calm, scales), iterations=SMOOTH_START_ITERATIONS, turning=True, should_stop=should_stop
     )
     turned, _ = cameras_of(calm, motion)
-    return _entered(gram, turned, candidate.basis_size, smooth_start=True, ordered=True, should_stop=should_stop)
+    return with_fixed_rotations(
+        gram, turned, candidate.basis_size, smooth_start=True, ordered=True, should_stop=should_stop
+    )
 
 
 def carried(rotations: Floats, best: Floats, used: NDArray[np.intp]) -> Floats:
@@ -167,26 +176,6 @@ def carried(rotations: Floats, best: Floats, used: NDArray[np.intp]) -> Floats:
     corrections = logarithm(turns @ common.T)
     blended = between(used, corrections, len(rotations))
     return np.asarray(rotations @ exponential(blended) @ common)
-
-
-def _entered(
-    gram: Floats,
-    rotations: Floats,
-    basis_size: int,
-    *,
-    smooth_start: bool,
-    ordered: bool,
-    should_stop: Callable[[], bool] | None,
-) -> Candidate:
-    scene = Scene.of(gram, rotations, with_scales=False, prior_weight=scaled_prior_weight(gram), ordered=ordered)
-    motion, energy = fit(
-        scene,
-        start(scene, np.ones(len(rotations))),
-        iterations=FIXED_ROTATION_ITERATIONS,
-        turning=False,
-        should_stop=should_stop,
-    )
-    return Candidate(basis_size, smooth_start, scene, motion, energy)
 
 
 def scaled_prior_weight(gram: Floats) -> float:

@@ -30,7 +30,7 @@ from pliant.solver.model.marginal_likelihood import root_matrix
 from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR
-from pliant.solver.records import Floats
+from pliant.solver.records import Floats, projections_of
 from pliant.solver.tracks.completion import Filling, often_visible, spans
 from pliant.solver.tracks.matrix import centred, columns
 from pliant.solver.tracks.normalization import Normalized
@@ -116,7 +116,7 @@ class Perspective:
     """The same of all sampled points, shape `(F, S, 2)`."""
 
     depth: Floats | DepthMap = field(default_factory=lambda: np.zeros((0, 0)))
-    """D of the latest cameras and covariance, shape `(F, 2F)`."""
+    """D of the latest cameras and covariance, shape `(F, 2F)`, or in factored form in long films."""
 
     @property
     def bends(self) -> bool:
@@ -134,8 +134,8 @@ def depth_map(rotations: Floats, scales: Floats, covariance: ShapeCovariance) ->
     """Return D, shape `(F, 2F)`, which maps centred image coordinates x1, y1, x2 … of a point to its depths."""
     if len(rotations) > LEARNED_FRAMES:
         away = rotations[:, 2] * scales[:, None]
-        return DepthMap(away, covariance.image_model(rotations[:, :2] * scales[:, None, None]), covariance)
-    projections = rotations[:, :2] * scales[:, None, None]
+        return DepthMap(away, covariance.image_model(projections_of(rotations, scales)), covariance)
+    projections = projections_of(rotations, scales)
     away, rows = rotations[:, 2] * scales[:, None], projections.reshape(-1, 3)
     wide = np.repeat(covariance.over_frames(), 2, axis=1)
     cross = away @ covariance.mean_covariance @ rows.T + (away @ covariance.axis_covariance @ rows.T) * wide
@@ -195,12 +195,7 @@ def density(depths: Floats, curvature: float) -> float:
 
 def mirrored(rotations: Floats, covariance: ShapeCovariance) -> tuple[Floats, ShapeCovariance]:
     """Return cameras and covariance with all depths reversed; orthographic images do not change."""
-    turned = replace(
-        covariance,
-        mean_covariance=MIRROR @ covariance.mean_covariance @ MIRROR,
-        axis_covariance=MIRROR @ covariance.axis_covariance @ MIRROR,
-    )
-    return MIRROR @ rotations @ MIRROR, turned
+    return MIRROR @ rotations @ MIRROR, covariance.turned(MIRROR)
 
 
 def corrected_moments(view: Perspective, normalized: Normalized) -> tuple[Floats, Floats, Floats]:

@@ -14,7 +14,6 @@ stay free, because the larger singular value of a plane's image is its scale.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -25,6 +24,7 @@ from pliant.solver.cameras.multistart import carried
 from pliant.solver.cameras.scale import rigid_scales
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, fit, start
 from pliant.solver.model.so3 import MIRROR, angles_between, from_rows, start_at_identity
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, Tracks
 from pliant.solver.tracks.frame_selection import every_nth, of_frames
 from scipy.optimize import minimize
@@ -102,7 +102,7 @@ def on_one_line(tracks: Tracks) -> bool:
 
 
 def resolve_pose_signs(
-    gram: Floats, rotations: Floats, *, ordered: bool = True, should_stop: Callable[[], bool] | None = None
+    gram: Floats, rotations: Floats, *, ordered: bool = True, should_stop: ShouldStop = never
 ) -> tuple[Floats, Floats | None, str]:
     """Return the rotations of a planar object, with other pose signs if more probable; an alternative or None; and a sentence.
 
@@ -131,7 +131,7 @@ def resolve_pose_signs(
     ]
     fits: list[PlanarCameras] = []
     for begun, sizes in starts:
-        if fits and should_stop is not None and should_stop():
+        if fits and should_stop():
             break
         fits.append(fitted(part, begun[used], sizes, ordered=ordered, should_stop=should_stop))
     best = min(fits, key=lambda each: each.energy)
@@ -158,7 +158,7 @@ def fitted(
     pose_signs: PoseSigns | None = None,
     iterations: int = FULL_ITERATIONS,
     ordered: bool = True,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> PlanarCameras:
     """Return the most probable cameras near the given ones; `pose_signs` (None: no reversals) are only recorded."""
     pose_signs = np.zeros(len(rotations), dtype=bool) if pose_signs is None else pose_signs
@@ -245,14 +245,12 @@ def smoothest_signs(rotations: Floats, order: int) -> PoseSigns:
     return np.array(pose_signs[::-1])
 
 
-def _reverse_greedily(
-    gram: Floats, found: PlanarCameras, should_stop: Callable[[], bool] | None, *, ordered: bool
-) -> PlanarCameras:
+def _reverse_greedily(gram: Floats, found: PlanarCameras, should_stop: ShouldStop, *, ordered: bool) -> PlanarCameras:
     """Return the cameras after greedy reversals, each of which improves the likelihood."""
     for _ in range(PASSES):
         plane, tried = _plane(found.motion), []
         for run in _runs(found.rotations @ plane[1]) if ordered else np.eye(len(found.rotations), dtype=bool):
-            if should_stop is not None and should_stop():
+            if should_stop():
                 return found
             turned = reversed_at(found.rotations, plane[0], run)
             tried.append(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from pliant.solver.cameras.factorization import upgrade
-from pliant.solver.records import Floats
+from pliant.solver.records import Floats, mean_scale, projections_of
 from pliant.solver.settings import Settings
 
 SCALE_SHARE = 0.85
@@ -51,7 +51,7 @@ def rigid_evidence(gram: Floats, settings: Settings) -> tuple[Floats, str]:
 
 
 def _unexplained(gram: Floats, rotations: Floats, scales: Floats) -> float:
-    basis = np.linalg.qr((rotations[:, :2] * scales[:, None, None]).reshape(len(gram), 3))[0]
+    basis = np.linalg.qr(projections_of(rotations, scales).reshape(len(gram), 3))[0]
     return float(np.trace(gram) - np.trace(basis.T @ gram @ basis))
 
 
@@ -60,7 +60,7 @@ def rigid_scales(gram: Floats, rotations: Floats) -> Floats:
     frames = len(rotations)
     scales = np.ones(frames)
     for _ in range(ALTERNATIONS):
-        rows = (rotations[:, :2] * scales[:, None, None]).reshape(2 * frames, 3)
+        rows = projections_of(rotations, scales).reshape(2 * frames, 3)
         pseudo = np.linalg.pinv(rows)
         shape_gram, cross = pseudo @ gram @ pseudo.T, (gram @ pseudo.T).reshape(frames, 2, 3)
         pair = rotations[:, :2]
@@ -69,5 +69,5 @@ def rigid_scales(gram: Floats, rotations: Floats) -> Floats:
         scales = np.maximum(hit, 1e-3 * size) / np.maximum(size, np.finfo(float).tiny)
         typical = np.median(scales)  # a frame without visible points has no scale
         scales = np.clip(scales, 1e-2 * typical + 1e-12, 1e2 * typical + 1e-12)
-        scales = np.asarray(scales / np.exp(np.log(scales).mean()))
+        scales = np.asarray(scales / mean_scale(scales))
     return scales

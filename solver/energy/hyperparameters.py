@@ -21,7 +21,7 @@ from pliant.solver.settings import Settings
 from pliant.solver.tracks.noise import magnified, weighted_median
 from pliant.solver.tracks.normalization import Normalized
 
-PAPER = Weights(temporal=1e-3, spatial=1.0, low_rank=0.0, robust_scale=1e-3, order=1, rank_floor=1e-4)
+PAPER = Weights(temporal=1e-3, spatial=1.0, low_rank=0.0, robust_scale=1e-3, order=1)
 """Values of Dai, Deng, He (2017), section 5: λ1 = 1e-3, λ2 = 1, first order, no low-rank prior; unit: the tracks' RMS radius."""
 
 STIFFEST = 30.0

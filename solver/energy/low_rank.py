@@ -12,10 +12,12 @@ identity minus one term per mode above δ. It costs one eigenproblem of size F, 
 from __future__ import annotations
 
 import numpy as np
-from pliant.solver.energy.problem import Array
 from pliant.solver.operators.normal_equations import RankTerm
-from pliant.solver.records import Floats
+from pliant.solver.records import Array, Floats
 from scipy import linalg
+
+RANK_FLOOR = 1e-4
+"""δ: variance per point, normalized units squared, below which a mode counts as noise."""
 
 
 def frame_gram(shapes: Array) -> Floats:
@@ -25,21 +27,21 @@ def frame_gram(shapes: Array) -> Floats:
     return gram
 
 
-def rank_penalty(shapes: Array, weight: float, floor: float) -> float:
+def rank_penalty(shapes: Array, weight: float) -> float:
     """Return λ3 P Σ φ(g_i)."""
     if weight == 0:
         return 0.0
     values = np.maximum(linalg.eigvalsh(frame_gram(shapes)), 0.0)
-    ratio = values / floor
+    ratio = values / RANK_FLOOR
     total = float(np.sum(np.where(ratio <= 1, ratio, 1 + np.log(np.maximum(ratio, 1)))))
     return weight * total * int(shapes.shape[2])
 
 
-def rank_term(shapes: Array, weight: float, floor: float) -> RankTerm | None:
+def rank_term(shapes: Array, weight: float) -> RankTerm | None:
     """Return the quadratic that touches the penalty at these shapes and majorises it elsewhere; None if `weight` is 0."""
     if weight == 0:
         return None
     values, vectors = linalg.eigh(frame_gram(shapes))
-    kept = values > floor
-    level = weight / floor
-    return RankTerm(level, vectors[:, kept], level * (1 - floor / values[kept]))
+    kept = values > RANK_FLOOR
+    level = weight / RANK_FLOOR
+    return RankTerm(level, vectors[:, kept], level * (1 - RANK_FLOOR / values[kept]))

@@ -4,24 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from pliant.solver.energy.low_rank import rank_penalty
-from pliant.solver.energy.problem import Array, Problem
+from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import loss_value, loss_weights
 from pliant.solver.operators.bending import bends_of, frames_together
 from pliant.solver.operators.normal_equations import rows_of
-from pliant.solver.records import Floats
+from pliant.solver.records import Array, Floats
 from pliant.solver.threads import SMALLEST, over_ranges
-
-
-def residuals(problem: Problem, shapes: Array, translations: Floats) -> Array:
-    """Return w − s R x − t, shape `(F, 2, P)`, normalized units; undefined where hidden."""
-    left = np.empty_like(problem.points, dtype=shapes.dtype)
-
-    def work(start: int, stop: int) -> None:
-        for frame in range(start, stop):
-            left[frame] = residuals_of(problem, shapes, translations, frame)
-
-    over_ranges(work, len(shapes), smallest=max(1, SMALLEST // shapes[0].size))
-    return left
 
 
 def residuals_of(problem: Problem, shapes: Array, translations: Floats, frame: int) -> Array:
@@ -30,18 +18,6 @@ def residuals_of(problem: Problem, shapes: Array, translations: Floats, frame: i
     image += translations[frame][:, None].astype(shapes.dtype)
     np.subtract(problem.points[frame], image, out=image)
     return image
-
-
-def objective(problem: Problem, shapes: Array, residual: Array) -> float:
-    """Return E = Σ v ρ(r) + λ1 ‖HX‖² + λ2 ‖AX‖² (Dai, Deng, He 2017, eq. 7) + rank penalty."""
-    parts = np.zeros(len(shapes))
-
-    def work(start: int, stop: int) -> None:
-        for frame in range(start, stop):
-            parts[frame] = loss_of(problem, residual[frame], frame)
-
-    over_ranges(work, len(shapes), smallest=max(1, SMALLEST // shapes[0].size))
-    return float(parts.sum()) + prior(problem, shapes)
 
 
 def loss_of(problem: Problem, residual: Array, frame: int) -> float:
@@ -59,12 +35,11 @@ def weights_of(problem: Problem, residual: Array, frame: int) -> Array:
 
 def prior(problem: Problem, shapes: Array) -> float:
     """Return the terms of the energy that do not depend on the tracks."""
-    weights = problem.weights
-    return smoothness(problem, shapes) + rank_penalty(shapes, weights.low_rank, weights.rank_floor)
+    return smoothness(problem, shapes) + rank_penalty(shapes, problem.weights.low_rank)
 
 
 def smoothness(problem: Problem, shapes: Array) -> float:
-    """Return λ1 ‖HX‖² + λ2 ‖AX‖²; with a Gaussian prior the first term is λ1 tr XᵀQX."""
+    """Return λ1 ‖HX‖² + λ2 ‖AX‖² (Dai, Deng, He 2017, eq. 7); with a Gaussian prior the first term is λ1 tr XᵀQX."""
     weights = problem.weights
     total = 0.0 if problem.quadratic is None else problem.quadratic.value(shapes)
     temporal = weights.temporal if problem.quadratic is None else 0.0

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.operators.gauss_markov import PathPrior
 from pliant.solver.operators.mesh_laplacian import Laplacian
-from pliant.solver.records import Floats
-
-Array = NDArray[np.floating]
+from pliant.solver.records import Array, Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,8 +23,6 @@ class Weights:
     """ε of the smoothed L1 or δ of Huber."""
     order: int
     """Order of H."""
-    rank_floor: float = 0.0
-    """δ of the low-rank prior: variance per point below which a mode counts as noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,9 +7,7 @@ tangent ω(r₀) r² + constant with ω(r) = ρ'(r) / 2r. Any decrease of the we
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.floating]
+from pliant.solver.records import Array
 
 
 def loss_value(residual: Array, confidence: Array, *, loss: str, scale: float) -> float:

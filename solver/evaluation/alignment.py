@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 from pliant.solver.errors import InvalidInput
-from pliant.solver.model.so3 import MIRROR
+from pliant.solver.model.so3 import MIRROR, nearest
 from pliant.solver.records import Floats
 from pliant.solver.tracks.matrix import centred
 
@@ -86,20 +86,15 @@ def align(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -> Align
     return Aligned(turned, fixed, transforms, scales)
 
 
-def procrustes(products: Floats, *, proper: bool = False) -> Floats:
-    """Return the orthogonal Q that maximises `tr(Qᵀ M)` for every 3×3 matrix M, shape `(…, 3, 3)`.
+def procrustes(products: Floats) -> Floats:
+    """Return the orthogonal Q that maximises `tr(Qᵀ M)` for every 3×3 matrix M, shape `(…, 3, 3)`; `so3.nearest` returns rotations only.
 
     Parameters
     ----------
     products : array, shape (…, 3, 3)
         `M = Gᵀ S` for shapes whose rows are points.
-    proper : bool
-        Rotations only (determinant +1).
     """
     left, _, right = np.linalg.svd(products)
-    if proper:
-        sign = np.sign(np.linalg.det(left) * np.linalg.det(right))
-        left[..., :, 2] *= sign[..., None]
     return np.asarray(left @ right)
 
 
@@ -110,7 +105,7 @@ def frobenius(shapes: Floats) -> Floats:
 
 def _rotate_frames(moved: Floats, fixed: Floats, *, mirror: Floats) -> Aligned:
     products = fixed.transpose(0, 2, 1) @ moved @ mirror
-    transforms = procrustes(products, proper=True) @ mirror
+    transforms = nearest(products) @ mirror
     return Aligned(moved @ transforms.transpose(0, 2, 1), fixed, transforms, np.ones(len(moved)))
 
 

@@ -32,9 +32,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 from pliant.solver.errors import InvalidInput
-from pliant.solver.evaluation.alignment import Aligned, Kind, align, procrustes
+from pliant.solver.evaluation.alignment import Aligned, Kind, align
 from pliant.solver.limits import frame_chunks
-from pliant.solver.model.so3 import MIRROR
+from pliant.solver.model.so3 import MIRROR, nearest
 from pliant.solver.records import Camera, Floats, Tracks
 from pliant.solver.solution import Solution
 
@@ -225,7 +225,7 @@ def _mocap(aligned: Aligned) -> float:
 
 
 def _mean_angle(ours: Floats, true: Floats) -> float:
-    turn = procrustes(np.einsum("fji,fjk->ik", ours, true), proper=True)
+    turn = nearest(np.einsum("fji,fjk->ik", ours, true))
     left_over = (ours @ turn).transpose(0, 2, 1) @ true
     sine = np.linalg.norm(left_over - left_over.transpose(0, 2, 1), axis=(1, 2)) / np.sqrt(8.0)
     cosine = (np.trace(left_over, axis1=1, axis2=2) - 1) / 2

@@ -8,10 +8,10 @@ other lengths. The edge lengths of a real sheet belong to one object, so disjoin
 from __future__ import annotations
 
 import numpy as np
-from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.isometry.focal_sweep import FocalSearch, Tried
 from pliant.solver.isometry.inextensible import maximum_depth
 from pliant.solver.isometry.refinement import refine
+from pliant.solver.model.so3 import nearest
 from pliant.solver.records import Floats
 
 DISAGREEMENT = 0.02
@@ -60,6 +60,6 @@ def deformation(points: Floats) -> float:
     mean = centred[0]
     aligned = centred
     for _ in range(ALIGNMENTS):
-        aligned = centred @ procrustes(centred.transpose(0, 2, 1) @ mean, proper=True)
+        aligned = centred @ nearest(centred.transpose(0, 2, 1) @ mean)
         mean = aligned.mean(axis=0)
     return float(np.sqrt(np.square(aligned - mean).sum() / np.square(centred).sum()))

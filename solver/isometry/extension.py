@@ -11,17 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.isometry.inextensible import Indices
+from pliant.solver.model.so3 import nearest
 from pliant.solver.records import Floats
 from pliant.solver.tracks.noise import RAYLEIGH_MEDIAN
 from scipy import sparse
 from scipy.sparse.csgraph import shortest_path
 
 MIN_ANCHORS, MIN_WIDTH = 6, 0.3
-"""Minimum number of visible anchors for a frame to be used, and minimum standard deviation of their template positions in the direction in
-which they extend least, relative to the template's: anchors on a line do not determine the pose of the surface. A rolled sheet of 7 × 7
-points, one frame of which shows one or two rows: the error of that frame is .06, and .26 to .64 with any width."""
+"""Minimum number of anchors, in total and visible in a frame to use it, and minimum standard deviation of their template positions in
+the direction in which they extend least, relative to the template's: anchors on a line do not determine the pose of the surface. A rolled
+sheet of 7 × 7 points, one frame of which shows one or two rows: the error of that frame is .06, and .26 to .64 with any width."""
 
 STIFF = 1e-3
 """Smoothing of the splines, in units of the template's squared standard deviation; needed because the anchors' depths are not exact."""
@@ -199,5 +199,5 @@ def _alike(points: Floats, seen: NDArray[np.bool_], frame: int) -> Indices:
 def _moved(source: Floats, target: Floats, used: NDArray[np.bool_]) -> Floats:
     """Return `source (A, 3)` after the rigid motion that aligns its `used` points with those of `target`."""
     here, there = source[used].mean(axis=0), target[used].mean(axis=0)
-    turn = procrustes((target[used] - there).T @ (source[used] - here), proper=True)
+    turn = nearest((target[used] - there).T @ (source[used] - here))
     return np.asarray((source - here) @ turn.T + there)

@@ -7,7 +7,6 @@ neighbouring one, the first from the conic program.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from pliant.solver.isometry.anchors import Anchors
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import Isometry, refine
+from pliant.solver.pulse import ShouldStop
 from pliant.solver.records import Floats
 
 MAX_INCONSISTENCY = 0.012
@@ -61,12 +61,7 @@ class FocalSearch:
     centre: Floats
     """Principal point, shape `(2,)`."""
 
-    should_stop: Callable[[], bool] | None
-
-    @property
-    def stopped(self) -> bool:
-        """Whether a stop has been requested."""
-        return self.should_stop is not None and self.should_stop()
+    should_stop: ShouldStop
 
     def graph(self, focal: float, frames: NDArray[np.intp] | slice = slice(None)) -> SurfaceGraph:
         """Return the rays and edges of the given frames at a focal length."""
@@ -96,7 +91,7 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
         min(FOCAL_RANGE[0] * diagonal, focal),
         max(FOCAL_RANGE[1] * diagonal, focal),
     )  # a given one may be outside
-    while not search.stopped:
+    while not search.should_stop():
         least = least_of(tried)
         if not low <= least.focal <= high:
             break
@@ -150,7 +145,7 @@ def _golden(search: FocalSearch, middle: Tried) -> list[Tried]:
     left, right = high - share * (high - low), low + share * (high - low)
     at_left, at_right = at(left), at(right)
     for _ in range(GOLDEN_STEPS - 2):
-        if search.stopped:
+        if search.should_stop():
             return made
         if at_left <= at_right:
             high, right, at_right = right, left, at_left

@@ -11,11 +11,11 @@ starting point nor a template. Hidden observations have no variables and no cone
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from scipy import sparse
 
@@ -55,7 +55,7 @@ class SurfaceGraph:
         return number[frame, self.edges[edge, 0]], number[frame, self.edges[edge, 1]]
 
 
-def maximum_depth(graph: SurfaceGraph, *, should_stop: Callable[[], bool] | None = None) -> Floats | None:
+def maximum_depth(graph: SurfaceGraph, *, should_stop: ShouldStop = never) -> Floats | None:
     """Return depths `(F, A)` of the deepest inextensible surface, in units of Σ d_ij; 0 where hidden.
 
     Return None if no two neighbours are visible together, if Clarabel finds no solution, or if `should_stop` returns True between its
@@ -102,7 +102,7 @@ def _program(graph: SurfaceGraph) -> tuple[sparse.csc_matrix, Floats]:
 
 
 def _solved(
-    matrix: sparse.csc_matrix, bound: Floats, *, gain: Floats, cones: int, should_stop: Callable[[], bool] | None
+    matrix: sparse.csc_matrix, bound: Floats, *, gain: Floats, cones: int, should_stop: ShouldStop
 ) -> Floats | None:
     """Return the depths of the visible observations."""
     import clarabel  # imported here because only sequences that look like a sheet need it
@@ -117,7 +117,6 @@ def _solved(
     options.tol_gap_rel = options.tol_gap_abs = options.tol_feas = ACCURACY
     nothing = sparse.csc_matrix((variables, variables))
     solver = clarabel.DefaultSolver(nothing, cost, matrix, bound, kinds, options)
-    if should_stop is not None:
-        solver.set_termination_callback(lambda _: should_stop())
+    solver.set_termination_callback(lambda _: should_stop())
     solved = solver.solve()
     return np.asarray(solved.x)[:observations] if str(solved.status) in SOLVED else None

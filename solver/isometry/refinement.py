@@ -9,11 +9,11 @@ solve the reduced equations of the lengths.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from pliant.solver.isometry.inextensible import SurfaceGraph
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
@@ -104,9 +104,7 @@ def residuals(graph: SurfaceGraph, log_depths: Floats, lengths: Floats) -> tuple
     return length - lengths[edge], sparse.csr_matrix((values, (np.tile(row, 3), columns)), shape=size)
 
 
-def refine(
-    graph: SurfaceGraph, depths: Floats, *, iterations: int = 30, should_stop: Callable[[], bool] | None = None
-) -> Isometry:
+def refine(graph: SurfaceGraph, depths: Floats, *, iterations: int = 30, should_stop: ShouldStop = never) -> Isometry:
     """Return depths with nearly constant edge lengths, close to the given ones.
 
     Parameters
@@ -127,7 +125,7 @@ def refine(
     ease = max(EASE * float(np.median(np.abs(first))), MIN_EASE * float(lengths[lengths > 0].mean()))
     here, damping = _at(graph, log_depths, lengths, ease), 1e-3
     for _ in range(iterations):
-        if should_stop is not None and should_stop():
+        if should_stop():
             break
         after, damping = _lower(graph, here, damping, ease)
         if after is None:

@@ -9,18 +9,18 @@ lengths, and if halves of the frames lead to the same edge lengths (`confirmatio
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.anchors import choose_anchors, connected, nearest_neighbours, unlike_frames
 from pliant.solver.isometry.confirmation import DECISIVE, DISAGREEMENT, deformation, disagreement
-from pliant.solver.isometry.extension import Extended, complete_anchors, extend, flatten
+from pliant.solver.isometry.extension import MIN_ANCHORS, Extended, complete_anchors, extend, flatten
 from pliant.solver.isometry.focal_sweep import CLEAR, FocalSearch, Judgement, Tried, judged, least_of, sweep
 from pliant.solver.isometry.homographies import off_homography
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import Isometry, edge_lengths, inconsistency, refine, typical
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, Tracks
 
 ANCHORS = 60
@@ -56,9 +56,6 @@ FIRST_LOOK = 200
 """Approximate number of points used to choose dissimilar frames and to measure deformation."""
 
 TOO_LITTLE = "Too few points are visible in the same frames for an isometric surface."
-
-FEWEST_ANCHORS = 6
-"""Minimum number of anchors of a surface, in total and per frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +114,7 @@ def isometric_surface(
     principal_point: tuple[float, float] | None = None,
     image_size: tuple[float, float] | None = None,
     required: bool = False,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> IsometricVerdict:
     """Decide whether the tracks show an isometric surface, and reconstruct it.
 
@@ -142,16 +139,14 @@ def isometric_surface(
     if isinstance(search, str):
         return IsometricVerdict(search)
     tried = sweep(search, first, diagonal, given=focal is not None)
-    if search.stopped:
+    if search.should_stop():
         return IsometricVerdict("Stopped before the test for isometry had finished.", _trace(tried))
     if not tried:
         return IsometricVerdict("No isometric surface was found: the conic program has no solution.", _trace(tried))
     return _verdict(search, tracks, tried, focal, required)
 
 
-def _search(
-    tracks: Tracks, centre: Floats, focal: float, required: bool, should_stop: Callable[[], bool] | None
-) -> FocalSearch | str:
+def _search(tracks: Tracks, centre: Floats, focal: float, required: bool, should_stop: ShouldStop) -> FocalSearch | str:
     """Return the anchors of all frames, or the reason why dissimilar frames at one focal length exclude an isometric sheet."""
     seen = tracks.visible > 0
     part = _some_frames(tracks.points, seen)
@@ -190,7 +185,7 @@ def sheetlike(tracks: Tracks) -> float | None:
     """
     seen = tracks.visible > 0
     part = _some_frames(tracks.points, seen)
-    search = _prepared(tracks.points[part], seen[part], np.zeros(2), None)
+    search = _prepared(tracks.points[part], seen[part], np.zeros(2), never)
     off = float("inf") if search is None else off_homography(search.anchors)
     return off if off <= SHEETLIKE else None
 
@@ -249,20 +244,18 @@ def _some_frames(points: Floats, seen: NDArray[np.bool_]) -> NDArray[np.intp]:
     return unlike_frames(points[:, often], seen[:, often], SOLVED_FRAMES)
 
 
-def _prepared(
-    points: Floats, seen: NDArray[np.bool_], centre: Floats, should_stop: Callable[[], bool] | None
-) -> FocalSearch | None:
-    if (seen.sum(axis=0) >= 2).sum() < FEWEST_ANCHORS:
+def _prepared(points: Floats, seen: NDArray[np.bool_], centre: Floats, should_stop: ShouldStop) -> FocalSearch | None:
+    if (seen.sum(axis=0) >= 2).sum() < MIN_ANCHORS:
         return None
     anchors = choose_anchors(points, seen, ANCHORS)
-    if anchors.points.shape[1] < FEWEST_ANCHORS:
+    if anchors.points.shape[1] < MIN_ANCHORS:
         return None
     edges = nearest_neighbours(anchors)
     if len(edges) == 0:
         return None
     known = connected(anchors.seen, edges)
     # Fewer anchors do not determine their depths, which would distort the lengths of all frames.
-    known &= known.sum(axis=1, keepdims=True) >= FEWEST_ANCHORS
+    known &= known.sum(axis=1, keepdims=True) >= MIN_ANCHORS
     if known.any(axis=1).sum() < 2:
         return None
     frames = unlike_frames(anchors.points, known, SOLVED_FRAMES)
@@ -290,7 +283,9 @@ def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried) -> Isometric
     found = min(found, chosen.found, key=lambda each: each.inconsistency)
     if len(search.frames) < tracks.num_frames:
         found = refine(whole, _from_similar(whole, search, found.depths), should_stop=search.should_stop)
-    if not search.stopped:  # short edges only: the chord of a long one is shorter than the surface between its ends
+    if (
+        not search.should_stop()
+    ):  # short edges only: the chord of a long one is shorter than the surface between its ends
         near = replace(
             whole, edges=nearest_neighbours(replace(search.anchors, seen=search.seen), neighbours=LAST_NEIGHBOURS)
         )

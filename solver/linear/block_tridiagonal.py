@@ -13,13 +13,10 @@ by two orders of magnitude, so one mean weight per frame, as in the cosine preco
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.linear.conjugate_gradient import Linear
 from pliant.solver.operators.normal_equations import Operator
-from pliant.solver.records import Floats
+from pliant.solver.records import Array, Floats
 from pliant.solver.threads import over_ranges
-
-Array = NDArray[np.floating]
 
 POINTS_PER_BLOCK = 8192
 """Number of points eliminated together, so that one frame of them fits in the processor's cache. Milliseconds per

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
-from pliant.solver.pulse import pulse
+from pliant.solver.pulse import ShouldStop, never, pulse
+from pliant.solver.records import Array
 from pliant.solver.threads import SMALLEST, over_ranges
-
-Array = NDArray[np.floating]
 
 
 class Linear(Protocol):
@@ -27,9 +25,7 @@ class Solved:
 
     x: Array
     iterations: int
-    relative: float
-    """Ratio of the final to the initial preconditioned residual norm √(rᵀM⁻¹r)."""
-    decrease: float = 0.0
+    decrease: float
     """Decrease of xᵀ𝒜x − 2bᵀx."""
 
 
@@ -41,7 +37,7 @@ def conjugate_gradient(
     reduction: float,
     max_iterations: int,
     negligible: float = 0.0,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> Solved:
     """Solve 𝒜 x = b, starting from 0, for a symmetric positive (semi)definite 𝒜; b is overwritten.
 
@@ -56,17 +52,16 @@ def conjugate_gradient(
     residual share an array, as they are never needed at the same time.
     """
     x, residual, spare = np.zeros_like(b), b, np.empty_like(b)
-    if should_stop is not None:
-        should_stop()  # to report progress: first touching gigabytes of memory takes as long as an iteration
+    should_stop()  # to report progress: first touching gigabytes of memory takes as long as an iteration
     z = precondition(residual, out=spare)
     pulse()
     direction = np.empty_like(b)
     direction[...] = z
-    first = rz = dot(residual, z)
-    enough = max(negligible, max(reduction, 10 * float(np.finfo(b.dtype).eps)) ** 2 * first)
+    rz = dot(residual, z)
+    enough = max(negligible, max(reduction, 10 * float(np.finfo(b.dtype).eps)) ** 2 * rz)
     done, decrease = 0, 0.0
     while done < max_iterations and rz > enough:
-        if should_stop is not None and should_stop():
+        if should_stop():
             break
         image = apply(direction, out=spare)
         curvature = dot(direction, image)
@@ -78,7 +73,7 @@ def conjugate_gradient(
         before, rz = rz, dot(residual, z)
         _turn(rz / before, z, direction)
         done += 1
-    return Solved(x, done, float(np.sqrt(max(rz, 0.0) / first)) if first > 0 else 0.0, decrease)
+    return Solved(x, done, decrease)
 
 
 def _advance(step: float, direction: Array, image: Array, *, x: Array, residual: Array) -> None:

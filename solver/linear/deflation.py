@@ -17,10 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.operators.normal_equations import Operator
-from pliant.solver.records import Floats
+from pliant.solver.records import Array, Floats
 from pliant.solver.threads import over_ranges
-
-Array = NDArray[np.floating]
 
 MAX_FREE_MODES = 12
 """Maximum number of modes per coordinate; memory is quadratic in it."""
@@ -33,6 +31,9 @@ UNLIKE = 0.1
 
 ENOUGH = 0.002
 """Share of deviating weights below which no correction is built."""
+
+MODE_BLOCK = 256
+"""Number of points inverted together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,10 +99,6 @@ def build_coarse(operator: Operator, stiffness: Floats) -> Coarse | None:
 
     over_ranges(work, len(points), smallest=MODE_BLOCK)
     return Coarse(modes, points, inverses)
-
-
-MODE_BLOCK = 256
-"""Number of points inverted together."""
 
 
 def _free_modes(operator: Operator, limit: float) -> tuple[tuple[Floats, Floats, Floats], list[Floats]]:

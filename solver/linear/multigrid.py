@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.linear import points
 from pliant.solver.linear.conjugate_gradient import Linear
 from pliant.solver.operators.aggregation import Level, Matrix
 from pliant.solver.operators.bending import add_transposed, frames_together, transposed
 from pliant.solver.operators.normal_equations import Operator
+from pliant.solver.records import Array
 from pliant.solver.threads import SMALLEST, over_ranges
-
-Array = NDArray[np.floating]
 
 
 def build(operator: Operator) -> Linear:

@@ -8,16 +8,12 @@ On 99 × 3,500 points of a face, conjugate gradients then need 9 iterations inst
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.linear import block_tridiagonal
 from pliant.solver.linear.conjugate_gradient import Linear
 from pliant.solver.linear.deflation import build_coarse
 from pliant.solver.linear.woodbury import MeanModes
 from pliant.solver.operators.normal_equations import Operator
-from pliant.solver.records import Floats
-
-Array = NDArray[np.floating]
+from pliant.solver.records import Array, Floats
 
 
 def build(operator: Operator, stiffness: Floats | None = None) -> Linear:
@@ -27,7 +23,7 @@ def build(operator: Operator, stiffness: Floats | None = None) -> Linear:
     """
     stiffness = block_tridiagonal.stiffness_of_neighbours(operator) if stiffness is None else stiffness
     paths = block_tridiagonal.build(operator, stiffness)
-    if operator.quadratic is None or operator.stencil[0].max() == 0:
+    if operator.quadratic is None:
         return paths
     modes, coarse = MeanModes.of(operator, float(stiffness.mean())), build_coarse(operator, stiffness)
 

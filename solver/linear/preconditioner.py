@@ -12,16 +12,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.linear import block_tridiagonal, multigrid, points
 from pliant.solver.linear.conjugate_gradient import Linear
 from pliant.solver.operators.normal_equations import Operator
 from pliant.solver.pulse import pulse
-from pliant.solver.records import Floats, Ints
+from pliant.solver.records import Array, Floats, Ints
 from pliant.solver.threads import available_cores, over_ranges
 from scipy import fft, linalg
 
-Array = NDArray[np.floating]
 MIN_POINTS_PER_THREAD = 1024
 """Minimum number of points per thread."""
 BENDS = 1.0
@@ -29,7 +27,10 @@ BENDS = 1.0
 
 
 def temporal_matrix(operator: Operator) -> Floats:
-    """Return T, dense `(3F, 3F)`: data term with mean weights per frame, stencil and modes over frames, rank term."""
+    """Return T, dense `(3F, 3F)`: data term with mean weights per frame, stencil over frames, rank term.
+
+    A Gaussian prior has no other part here: with a weight above 0, its equations are inverted for each point.
+    """
     frames = len(operator.projections)
     cameras = operator.projections.astype(np.float64)
     mean = operator.weights.mean(axis=2, dtype=np.float64)
@@ -43,9 +44,6 @@ def temporal_matrix(operator: Operator) -> Floats:
     whole = np.kron(over_frames, np.eye(3)).reshape(frames, 3, frames, 3)
     index = np.arange(frames)
     whole[index, :, index, :] += blocks
-    if operator.quadratic is not None:
-        for axis, matrix in enumerate(operator.quadratic.matrices()):
-            whole[:, axis, :, axis] += matrix
     return np.asarray(whole.reshape(3 * frames, 3 * frames), dtype=np.float64)
 
 
@@ -110,9 +108,7 @@ def _alike(operator: Operator) -> Linear:
     temporal = Diagonalised.of(operator, kind)
     if laplacian.grid is not None:
         return lambda r, out=None: _by_cosines(r, temporal, laplacian.grid, operator.spatial_weight)  # noqa: ARG005
-    diagonal: Floats = (
-        operator.spatial_weight * np.asarray(laplacian.matrix.power(2).sum(axis=0), dtype=np.float64).ravel()
-    )
+    diagonal = block_tridiagonal.stiffness_of_neighbours(operator)
     return lambda r, out=None: _by_point(r, temporal, diagonal)  # noqa: ARG005
 
 

@@ -11,12 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.linear import block_tridiagonal
 from pliant.solver.operators.gauss_markov import over_blocks
 from pliant.solver.operators.normal_equations import Operator
-
-Array = NDArray[np.floating]
+from pliant.solver.records import Array
 
 LEAST = 1e-12
 """Floor of the eigenvalues of I − VᵀN⁻¹V; about the ratio of noise to the variance of an unobserved mode."""

@@ -11,7 +11,7 @@ If the motion has few modes, the held-out likelihood improves to the end and EM 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,15 +19,17 @@ from pliant.solver.model.expectation_maximisation import (
     ANNEALING_START,
     MAX_MODES,
     WALK_VARIANCE_FLOOR,
+    ModelOrder,
     learned,
     rounds,
     scratch,
 )
-from pliant.solver.model.model_order import MIN_JUDGED_POINTS, MIN_NLL_GAIN, ModelOrder, held_out_nll
+from pliant.solver.model.model_order import MIN_JUDGED_POINTS, MIN_NLL_GAIN, held_out_nll
 from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import MAX_SAMPLE_POINTS
-from pliant.solver.tracks.matrix import columns
+from pliant.solver.tracks.matrix import columns, gram_of
 
 FOLDS = 3
 """Folds of the cross-validation over points."""
@@ -66,7 +68,7 @@ def learn_with_early_stopping(
     model_order: ModelOrder,
     *,
     seed: int = 0,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> tuple[ShapeCovariance, str]:
     """Return the covariance learned from scratch in the number of rounds that held-out points favour, and a sentence.
 
@@ -90,14 +92,7 @@ def learn_with_early_stopping(
         covariance = early.learned(gram, projections)
         reason = f"learned in {len(early.floors)} rounds; more would make held-out points less probable."
         return covariance, described(covariance, reason)
-    covariance = learned(
-        gram,
-        projections,
-        max_modes=model_order.max_modes,
-        noisy_start=model_order.noisy_start,
-        ordered=model_order.ordered,
-        should_stop=should_stop,
-    )
+    covariance = learned(gram, projections, model_order, should_stop=should_stop)
     reason = (
         f"more than {model_order.max_modes} modes, learned from some points, do not make other points more probable."
     )
@@ -110,7 +105,7 @@ def schedule(
     model_order: ModelOrder,
     *,
     seed: int = 0,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> Schedule | None:
     """Return the rounds that held-out points favour; None where they favour all rounds. Arguments as for `learn_with_early_stopping`."""
     frames, count = sample.shape[:2]
@@ -136,30 +131,26 @@ def described(covariance: ShapeCovariance, more: str = "") -> str:
     return f"{found}; {more}" if more else f"{found}."
 
 
-def _judged(
-    points: Floats, projections: Floats, way: Schedule, seed: int, should_stop: Callable[[], bool] | None
-) -> list[float]:
+def _judged(points: Floats, projections: Floats, way: Schedule, seed: int, should_stop: ShouldStop) -> list[float]:
     """Return the mean held-out negative log likelihood after every round, until it has risen by `MAX_NLL_RISE`."""
     part = np.random.default_rng(seed).permutation(points.shape[1]) % FOLDS
     paths, others = [], []
     for fold in range(FOLDS):
         own = points[:, part != fold]
-        paths.append(_rounds(own @ own.T / own.shape[1], projections, way.model_order, way.floors))
+        paths.append(_rounds(gram_of(own), projections, way.model_order, way.floors))
         others.append(points[:, part == fold])
     found: list[float] = []
     for covariances in zip(*paths, strict=True):
         energies = [held_out_nll(each, projections, other) for each, other in zip(covariances, others, strict=True)]
         found.append(sum(energies) / FOLDS)
-        if found[-1] > min(found) + MAX_NLL_RISE or (should_stop is not None and should_stop()):
+        if found[-1] > min(found) + MAX_NLL_RISE or should_stop():
             break
     return found
 
 
 def _rounds(gram: Floats, projections: Floats, model_order: ModelOrder, floors: Floats) -> Iterator[ShapeCovariance]:
     """Yield the covariance after every round from scratch."""
-    start = scratch(
-        gram, projections, model_order.max_modes, noisy_start=model_order.noisy_start, ordered=model_order.ordered
-    )
+    start = scratch(gram, projections, model_order)
     return rounds(start, gram, projections, floors=floors, max_modes=model_order.max_modes)
 
 

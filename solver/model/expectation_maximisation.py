@@ -8,7 +8,7 @@ statistics are in the 2F×2F Gram matrix W Wᵀ / P and the cost does not depend
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pliant.solver.model.image_density import Explained, factor_of, inverted
@@ -16,6 +16,7 @@ from pliant.solver.model.marginal_likelihood import root_matrix
 from pliant.solver.model.random_walk import WalkPosterior, coloured, walk_bands, whitened, whitener
 from pliant.solver.model.shape_covariance import AXIS_VARIANCE_FLOOR, NOISE_VARIANCE_FLOOR, ShapeCovariance
 from pliant.solver.model.so3 import IDENTITY
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.tracks.noise import roughness
 from scipy.linalg import lapack
@@ -55,15 +56,27 @@ GUARD_VECTORS = 8
 """Eigenvectors beyond the modes that are carried from round to round, from which new modes emerge."""
 
 
+@dataclass(frozen=True, slots=True)
+class ModelOrder:
+    """Limits with which the covariance is learned."""
+
+    max_modes: int = MAX_MODES
+    """Maximum number of modes, the columns of L."""
+
+    noisy_start: bool = False
+    """Whether EM starts with the roughness of the tracks as its noise, instead of a low noise."""
+
+    ordered: bool = True
+    """True for a film, False for photographs in no order."""
+
+
 def learned(
     gram: Floats,
     projections: Floats,
+    model_order: ModelOrder,
     *,
-    max_modes: int = MAX_MODES,
-    noisy_start: bool = False,
-    ordered: bool = True,
     iterations: int = MAX_ITERATIONS,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> ShapeCovariance:
     """Return the more probable of two covariances learned by EM from scratch.
 
@@ -77,58 +90,37 @@ def learned(
         W Wᵀ / P of centred, complete tracks, normalized units.
     projections : array, shape (F, 2, 3)
         s_f times the first two rows of R_f.
-    max_modes : int
-        Maximum number of columns of L.
-    noisy_start : bool
-        Start with the roughness of the tracks as noise instead of a low noise.
+    model_order : ModelOrder
+        Maximum number of modes, and the starting noise.
     iterations : int
         Maximum number of EM rounds of a run.
     should_stop : callable, optional
         Called after every round; once it returns True, the best so far is returned.
     """
     count = min(iterations, max(MIN_ITERATIONS, ITERATION_FRAMES // len(projections)))
-    warm = freed(
-        annealed(
-            gram,
-            projections,
-            max_modes=max_modes,
-            noisy_start=noisy_start,
-            ordered=ordered,
-            iterations=count,
-            should_stop=should_stop,
-        )
-    )
+    max_modes = model_order.max_modes
+    warm = freed(annealed(gram, projections, model_order, iterations=count, should_stop=should_stop))
+    cold = scratch(gram, projections, model_order)
     runs = (
         improve(warm, gram, projections, iterations=count // 2, max_modes=max_modes, should_stop=should_stop),
-        improve(
-            scratch(gram, projections, max_modes, noisy_start=noisy_start, ordered=ordered), gram, projections,
-            iterations=count, max_modes=max_modes, should_stop=should_stop,
-        ),
-    )  # fmt: skip
+        improve(cold, gram, projections, iterations=count, max_modes=max_modes, should_stop=should_stop),
+    )
     return min(runs, key=lambda run: run.nll)
 
 
 def annealed(
     gram: Floats,
     projections: Floats,
+    model_order: ModelOrder,
     *,
-    max_modes: int = MAX_MODES,
-    noisy_start: bool = False,
-    ordered: bool = True,
     iterations: int,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> ShapeCovariance:
     """Return the covariance after `iterations` annealed rounds from scratch."""
-    start = scratch(gram, projections, max_modes, noisy_start=noisy_start, ordered=ordered)
     return improve(
-        start,
-        gram,
-        projections,
-        iterations=iterations,
-        warm=ANNEALING_START,
-        max_modes=max_modes,
-        should_stop=should_stop,
-    )
+        scratch(gram, projections, model_order), gram, projections, iterations=iterations, warm=ANNEALING_START,
+        max_modes=model_order.max_modes, should_stop=should_stop,
+    )  # fmt: skip
 
 
 def freed(covariance: ShapeCovariance) -> ShapeCovariance:
@@ -137,27 +129,7 @@ def freed(covariance: ShapeCovariance) -> ShapeCovariance:
     return replace(covariance, modes=np.hstack([covariance.modes, constant]))
 
 
-def scratch(
-    gram: Floats, projections: Floats, max_modes: int, *, noisy_start: bool, ordered: bool = True
-) -> ShapeCovariance:
-    """Return a starting covariance (`begin`) with the low or, with `noisy_start`, the high starting noise."""
-    return begin(
-        gram,
-        projections,
-        noise_variance=max(roughness(gram), START_NOISE_VARIANCE) if noisy_start else START_NOISE_VARIANCE,
-        max_modes=max_modes,
-        ordered=ordered,
-    )
-
-
-def begin(
-    gram: Floats,
-    projections: Floats,
-    *,
-    noise_variance: float = START_NOISE_VARIANCE,
-    max_modes: int = MAX_MODES,
-    ordered: bool = True,
-) -> ShapeCovariance:
+def scratch(gram: Floats, projections: Floats, model_order: ModelOrder) -> ShapeCovariance:
     """Return the starting covariance of least-squares shapes with least change between frames; if unordered, with least deformation.
 
     Parameters
@@ -166,17 +138,14 @@ def begin(
         W Wᵀ / P of centred, complete tracks, normalized units.
     projections : array, shape (F, 2, 3)
         s_f times the first two rows of R_f.
-    noise_variance : float
-        σ² to start from.
-    max_modes : int
-        Maximum number of columns of L.
-    ordered : bool
-        False for photographs in no order.
+    model_order : ModelOrder
+        Maximum number of modes, and the starting noise.
     """
-    frames, factor = len(projections), factor_of(gram)
+    frames, factor, ordered = len(projections), factor_of(gram), model_order.ordered
     if ordered:
         seen = projections.transpose(0, 2, 1) @ factor.reshape(frames, 2, -1)
-        walk = WalkPosterior.of(projections, noise_variance=1.0, walk_variance=walk_bands(frames)[1] / START_SMOOTHNESS)
+        walk_variance = walk_bands(frames, ordered)[1] / START_SMOOTHNESS
+        walk = WalkPosterior.of(projections, noise_variance=1.0, walk_variance=walk_variance, ordered=ordered)
         shapes = walk.solve(seen)
     else:
         rigid = np.linalg.pinv(projections.reshape(-1, 3)) @ factor
@@ -187,7 +156,8 @@ def begin(
     whole = flat @ flat.T / 3
     middle = whole.mean(axis=0)
     deformed = whole - middle - middle[:, None] + middle.mean()
-    modes, walk_variance = _split(deformed, ANNEALING_START, max_modes, ordered=ordered)
+    modes, walk_variance = _split(deformed, ANNEALING_START, model_order.max_modes, ordered=ordered)
+    noise_variance = max(roughness(gram), START_NOISE_VARIANCE) if model_order.noisy_start else START_NOISE_VARIANCE
     return ShapeCovariance(mean_covariance, np.eye(3), modes, walk_variance, noise_variance, np.inf, ordered)
 
 
@@ -199,7 +169,7 @@ def improve(
     iterations: int,
     warm: float = WALK_VARIANCE_FLOOR,
     max_modes: int = MAX_MODES,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> ShapeCovariance:
     """Return the covariance after rounds of EM with a floor of τ that falls from `warm` to `WALK_VARIANCE_FLOOR`.
 
@@ -208,7 +178,7 @@ def improve(
     floors = np.geomspace(warm, WALK_VARIANCE_FLOOR, iterations)
     for better in rounds(covariance, gram, projections, floors=floors, max_modes=max_modes):
         covariance = better
-        if should_stop is not None and should_stop():
+        if should_stop():
             break
     return covariance
 

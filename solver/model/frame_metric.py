@@ -42,7 +42,7 @@ class FrameMetric:
         walk = np.ones(frames)
         if ordered:
             stiffness = 4 * np.sin(np.pi * np.arange(frames) / (2 * frames)) ** 2 + LEVEL / frames**2
-            walk = 1 / (walk_bands(frames)[1] * stiffness)
+            walk = 1 / (walk_bands(frames, ordered=True)[1] * stiffness)
         spectrum = np.sqrt(noise_variance + walk_variance * walk)[:, None]
         vectors, values, _ = np.linalg.svd(
             (dct(modes, axis=0, norm="ortho") if ordered else modes) / spectrum, full_matrices=False

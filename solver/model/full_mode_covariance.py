@@ -19,7 +19,6 @@ decides whether it is used.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +27,8 @@ from pliant.solver.model.image_density import ImageModel, terms
 from pliant.solver.model.marginal_likelihood import UNLIKELY, Scene, cameras_and_jacobian, cameras_of, root_matrix
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import vee
-from pliant.solver.records import Floats
+from pliant.solver.pulse import ShouldStop, never
+from pliant.solver.records import Floats, projections_of
 from scipy.optimize import minimize
 
 POINTS_PER_COEFFICIENT = 4
@@ -118,7 +118,7 @@ def energy(scene: Scene, axis_covariance: Floats, basis: Basis) -> tuple[float, 
     """
     frames, size = basis.weights.shape
     rotations, scales, jacobian = cameras_and_jacobian(scene, basis)
-    projections = rotations[:, :2] * scales[:, None, None]
+    projections = projections_of(rotations, scales)
     root = root_matrix(axis_covariance)
     shapes = np.einsum("fk,fid->fikd", basis.weights, projections).reshape(2 * frames, 3 * size)
     noise, walk_variance = np.exp(2 * basis.logs)
@@ -152,7 +152,7 @@ def refined(
     scales: Floats,
     covariance: ShapeCovariance,
     *,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> tuple[Floats, Floats]:
     """Return rotations (F, 3, 3) and scales (F,) that minimise the energy, starting from the scene's cameras."""
     frames, size = len(scene.rotations), covariance.modes.shape[1] + 1
@@ -163,7 +163,7 @@ def refined(
         return value, gradient.flat()
 
     def stop_check(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
-        if should_stop is not None and should_stop():
+        if should_stop():
             raise StopIteration
 
     steps = min(MAX_STEPS, MAX_FRAME_STEPS // frames)

@@ -28,7 +28,8 @@ from pliant.solver.model.camera_motion_prior import STEADY, rotation_roughness, 
 from pliant.solver.model.frame_metric import FrameMetric
 from pliant.solver.model.image_density import ImageModel, Terms, factor_of, inverted, terms
 from pliant.solver.model.so3 import exponential_and_jacobian, vee
-from pliant.solver.records import Floats
+from pliant.solver.pulse import ShouldStop, never
+from pliant.solver.records import Floats, projections_of
 from scipy.optimize import minimize
 
 NOISE_STD_FLOOR = 3e-3
@@ -142,7 +143,7 @@ class Scene:
 def start(scene: Scene, scales: Floats, *, num_modes: int = NUM_MODES) -> Motion:
     """Return starting parameters: a rigid shape and, from its residual, the leading modes over time."""
     frames = len(scene.rotations)
-    rows = (scene.rotations[:, :2] * scales[:, None, None]).reshape(2 * frames, 3)
+    rows = projections_of(scene.rotations, scales).reshape(2 * frames, 3)
     inverse = np.linalg.pinv(rows)
     mean_covariance = inverse @ scene.gram @ inverse.T
     mean_covariance = mean_covariance + 1e-3 * np.trace(mean_covariance) / 3 * np.eye(3)
@@ -195,7 +196,7 @@ def covariances_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats, float,
 def image_of(scene: Scene, motion: Motion) -> ImageModel:
     """Return the covariance of the images in factored form."""
     rotations, scales = cameras_of(scene, motion)
-    return _image(scene, motion.modes, rotations[:, :2] * scales[:, None, None], *_shared(motion))
+    return _image(scene, motion.modes, projections_of(rotations, scales), *_shared(motion))
 
 
 def _image(
@@ -234,7 +235,7 @@ def _energy(scene: Scene, motion: Motion) -> tuple[float, Motion, Terms | None]:
     """Return E, its gradient, and the terms of the density; no terms where M is not positive definite."""
     frames = len(scene.rotations)
     rotations, scales, jacobian = cameras_and_jacobian(scene, motion)
-    projections = rotations[:, :2] * scales[:, None, None]
+    projections = projections_of(rotations, scales)
     root0, root1, noise, walk_variance = _shared(motion)
     try:
         if walk_variance == 0:  # underflow
@@ -273,7 +274,7 @@ def fit(
     iterations: int,
     turning: bool,
     metric: FrameMetric | None = None,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> tuple[Motion, float]:
     """Return the parameters that minimise the energy, by L-BFGS from `motion`, and the energy reached.
 
@@ -297,7 +298,7 @@ def fit(
         return factor * value, factor * slope[held:]
 
     def stop_check(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
-        if should_stop is not None and should_stop():
+        if should_stop():
             raise StopIteration
 
     found = minimize(

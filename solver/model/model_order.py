@@ -10,18 +10,18 @@ Without noise, additional modes do no harm and keep deformation out of the camer
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
-from pliant.solver.model.expectation_maximisation import MAX_MODES, annealed
+from pliant.solver.model.expectation_maximisation import MAX_MODES, ModelOrder, annealed
 from pliant.solver.model.image_density import negative_log_likelihoods
 from pliant.solver.model.marginal_likelihood import NOISE_STD_FLOOR
 from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import ranks
 from pliant.solver.tracks.frame_selection import evenly_spread
-from pliant.solver.tracks.matrix import columns
+from pliant.solver.tracks.matrix import columns, gram_of
 from pliant.solver.tracks.noise import typical_roughness
 
 MODE_COUNTS = (0, 2, 4, 8, 16, 32, MAX_MODES)
@@ -40,27 +40,13 @@ MIN_JUDGED_POINTS = 8
 """Minimum number of points for a comparison."""
 
 
-@dataclass(frozen=True, slots=True)
-class ModelOrder:
-    """Limits with which the covariance is learned."""
-
-    max_modes: int = MAX_MODES
-    """Maximum number of modes."""
-
-    noisy_start: bool = False
-    """Whether EM starts with the roughness of the tracks as its noise, instead of a low noise."""
-
-    ordered: bool = True
-    """True for a film, False for photographs in no order."""
-
-
 def select_model_order(
     sample: Floats,
     projections: Floats,
     *,
     ordered: bool = True,
     seed: int = 0,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> ModelOrder:
     """Return the order that the sample supports: no limit where there is no noise.
 
@@ -86,11 +72,11 @@ def select_model_order(
     one, other = rows[:, order[0::2]], rows[:, order[1::2]]
     quiet_start, noisy_start = (
         (
-            _judged(one, other, projections[used], noisy_start=each, ordered=ordered, should_stop=should_stop)
-            + _judged(other, one, projections[used], noisy_start=each, ordered=ordered, should_stop=should_stop)
+            _judged(one, other, projections[used], each, should_stop=should_stop)
+            + _judged(other, one, projections[used], each, should_stop=should_stop)
         )
         / 2
-        for each in (False, True)
+        for each in (ModelOrder(ordered=ordered), ModelOrder(noisy_start=True, ordered=ordered))
     )
     enough = min(float(quiet_start.min()), float(noisy_start.min())) + MIN_NLL_GAIN
     better = noisy_start if noisy_start.min() <= enough else quiet_start
@@ -106,28 +92,20 @@ def _judged(
     points: Floats,
     other: Floats,
     projections: Floats,
+    model_order: ModelOrder,
     *,
-    noisy_start: bool,
-    ordered: bool,
-    should_stop: Callable[[], bool] | None,
+    should_stop: ShouldStop,
 ) -> Floats:
-    """Return the held-out negative log likelihood for each number of modes."""
+    """Return the held-out negative log likelihood for each number of modes; `model_order` determines the start."""
     frames = len(projections)
-    gram = points @ points.T / points.shape[1]
+    gram = gram_of(points)
     counts = _counts(frames)
     energies = np.full(len(counts), np.inf)
     for index, max_modes in enumerate(counts):
-        if index and should_stop is not None and should_stop():
+        if index and should_stop():
             break
-        found = annealed(
-            gram,
-            projections,
-            max_modes=max_modes,
-            noisy_start=noisy_start,
-            ordered=ordered,
-            iterations=JUDGED_ITERATIONS,
-            should_stop=should_stop,
-        )
+        limited = replace(model_order, max_modes=max_modes)
+        found = annealed(gram, projections, limited, iterations=JUDGED_ITERATIONS, should_stop=should_stop)
         energies[index] = held_out_nll(found, projections, other)
     return energies
 

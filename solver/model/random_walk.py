@@ -31,7 +31,7 @@ LEVEL = 10.0
 
 
 @lru_cache(maxsize=32)
-def walk_bands(num_frames: int, ordered: bool = True) -> tuple[Floats, float]:
+def walk_bands(num_frames: int, ordered: bool) -> tuple[Floats, float]:
     """Return the upper bands of HᵀH + 10/F² I, shape `(2, F)`, and n, the mean of its inverse's diagonal.
 
     If unordered, return those of the identity, and 1.
@@ -60,7 +60,7 @@ def _pivots(diagonal: Floats, beside: Floats) -> Floats:
 
 
 @lru_cache(maxsize=8)
-def random_walk(num_frames: int, ordered: bool = True) -> Floats:
+def random_walk(num_frames: int, ordered: bool) -> Floats:
     """Return T, the covariance of the random walk, mean of the diagonal 1, shape `(F, F)`; read-only."""
     inverse, norm = walk_precision(num_frames, ordered)
     walk = np.asarray(np.linalg.inv(inverse) / norm, dtype=np.float64)
@@ -68,21 +68,21 @@ def random_walk(num_frames: int, ordered: bool = True) -> Floats:
     return walk
 
 
-def random_walk_at(used: NDArray[np.intp], num_frames: int, ordered: bool = True) -> Floats:
+def random_walk_at(used: NDArray[np.intp], num_frames: int, ordered: bool) -> Floats:
     """Return T restricted to the frames used, shape `(F', F')`, in time and memory linear in F."""
     columns = np.zeros((num_frames, len(used)))
     columns[used, np.arange(len(used))] = 1.0
     return walked(columns, ordered)[used]
 
 
-def walked(columns: Floats, ordered: bool = True) -> Floats:
+def walked(columns: Floats, ordered: bool) -> Floats:
     """Return T times columns of shape `(F, k)`, in time and memory linear in F."""
     bands, norm = walk_bands(len(columns), ordered)
     return np.asarray(solveh_banded(np.stack([np.append(0.0, bands[1, :-1]), bands[0]]), columns / norm))
 
 
 @lru_cache(maxsize=8)
-def whitener(num_frames: int, ordered: bool = True) -> Floats:
+def whitener(num_frames: int, ordered: bool) -> Floats:
     """Return the lower triangular root with T⁻¹ = root rootᵀ, shape `(F, F)`; read-only."""
     inverse, norm = walk_precision(num_frames, ordered)
     root = np.asarray(np.linalg.cholesky(inverse * norm), dtype=np.float64)
@@ -93,13 +93,13 @@ def whitener(num_frames: int, ordered: bool = True) -> Floats:
 @lru_cache(maxsize=32)
 def whitener_bands(num_frames: int) -> Floats:
     """Return the lower bands of the root in `whitener`, shape `(2, F)`; read-only."""
-    bands, norm = walk_bands(num_frames)
+    bands, norm = walk_bands(num_frames, ordered=True)
     root: Floats = lapack.dpbtrf(bands * norm, lower=1)[0]
     read_only(root)
     return root
 
 
-def whitened(columns: Floats, *, ordered: bool = True) -> Floats:
+def whitened(columns: Floats, *, ordered: bool) -> Floats:
     """Return rootᵀ times columns of shape `(F, k)`: in these coordinates the walk is white."""
     if not ordered:
         return columns
@@ -109,7 +109,7 @@ def whitened(columns: Floats, *, ordered: bool = True) -> Floats:
     return result
 
 
-def coloured(columns: Floats, *, ordered: bool = True, transposed: bool = False) -> Floats:
+def coloured(columns: Floats, *, ordered: bool, transposed: bool = False) -> Floats:
     """Return root⁻ᵀ times columns of shape `(F, k)`, the inverse of `whitened`; if `transposed`, root⁻¹ times the columns."""
     if not ordered or columns.shape[1] == 0:  # LAPACK writes beyond an array without columns
         return columns
@@ -118,13 +118,13 @@ def coloured(columns: Floats, *, ordered: bool = True, transposed: bool = False)
 
 
 @lru_cache(maxsize=32)
-def log_det_walk(num_frames: int, ordered: bool = True) -> float:
+def log_det_walk(num_frames: int, ordered: bool) -> float:
     """Return log det T."""
     bands, norm = walk_bands(num_frames, ordered)
     return -num_frames * float(np.log(norm)) - float(np.log(_pivots(bands[0], bands[1])).sum())
 
 
-def walk_precision(num_frames: int, ordered: bool = True) -> tuple[Floats, float]:
+def walk_precision(num_frames: int, ordered: bool) -> tuple[Floats, float]:
     """Return HᵀH + 10/F² I, shape `(F, F)`, and n."""
     bands, norm = walk_bands(num_frames, ordered)
     return np.diag(bands[0]) + np.diag(bands[1, :-1], 1) + np.diag(bands[1, :-1], -1), norm
@@ -147,7 +147,7 @@ class WalkPosterior:
     """log det Λ + log det τT ⊗ I₃."""
 
     @classmethod
-    def of(cls, images: Floats, *, noise_variance: float, walk_variance: float, ordered: bool = True) -> WalkPosterior:
+    def of(cls, images: Floats, *, noise_variance: float, walk_variance: float, ordered: bool) -> WalkPosterior:
         """Factor Λ for B_f of shape `(F, 2, 3)`, σ² and τ.
 
         Raises

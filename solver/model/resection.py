@@ -13,7 +13,6 @@ Levenberg–Marquardt on SO(3) (Hartley and Zisserman, Multiple View Geometry, 2
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -22,8 +21,10 @@ from pliant.solver.model.image_density import Explained
 from pliant.solver.model.marginal_likelihood import root_matrix
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential, from_rows, logarithm
-from pliant.solver.records import Floats
+from pliant.solver.pulse import ShouldStop, never
+from pliant.solver.records import Floats, projections_of
 from pliant.solver.threads import over_ranges
+from pliant.solver.tracks.frame_selection import between
 from pliant.solver.tracks.matrix import columns
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -68,7 +69,7 @@ class MeanShapes:
     @classmethod
     def of(cls, covariance: ShapeCovariance, rotations: Floats, scales: Floats, sample: Floats) -> MeanShapes:
         """Return the shapes for cameras and complete tracks `(F, S, 2)` of the frames that the covariance was learned from."""
-        projections = rotations[:, :2] * scales[:, None, None]
+        projections = projections_of(rotations, scales)
         found = Explained.of(covariance.image_model(projections), columns(sample)).means
         found = found.reshape(covariance.modes.shape[1] + 1, 3, -1)
         off = covariance.modes[1:-1] - (covariance.modes[:-2] + covariance.modes[2:]) / 2
@@ -160,13 +161,11 @@ def interpolated(used: NDArray[np.intp], rotations: Floats, scales: Floats, mode
     """Return the poses of all frames of a film, interpolated between those of the frames used."""
     at = np.clip(np.arange(num_frames), used[0], used[-1])
     turned = rotations_between(used, rotations, num_frames)
-    coefficients = np.zeros((num_frames, modes.shape[1]))
-    for number, mode in enumerate(modes.T):
-        coefficients[:, number] = np.interp(at, used, mode)
+    coefficients = between(used, modes, num_frames)
     before = np.clip(np.searchsorted(used, at, side="right") - 1, 0, len(used) - 2)
     share = (at - used[before]) / (used[before + 1] - used[before])
     doubt = np.where(at == np.arange(num_frames), np.maximum(4 * share * (1 - share), LEARNED_DOUBT), 1.0)
-    scales = np.exp(np.interp(at, used, np.log(scales)))
+    scales = np.exp(between(used, np.log(scales), num_frames))
     return Poses(turned, scales, coefficients, np.zeros((num_frames, 2)), coefficients, turned, doubt)
 
 
@@ -177,7 +176,7 @@ def resected(
     *,
     turning: bool,
     with_scales: bool,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> Poses:
     """Return the most probable pose of every frame.
 
@@ -200,7 +199,7 @@ def resected(
     group = 2 * FRAMES_TOGETHER
     for low in range(0, len(views.points), 8 * group):
         block = slice(low, min(low + 8 * group, len(views.points)))
-        if should_stop is not None and should_stop():
+        if should_stop():
             done.append(start.part(slice(low, None)))
             break
         done.append(_resected(views.part(block), shapes, start.part(block), turning, with_scales))
@@ -316,7 +315,7 @@ def _stepped(shapes: MeanShapes, poses: Poses, at: _Fit, damping: Floats, turnin
     """Return the poses after a damped Gauss–Newton step."""
     frames, count, points = len(at.cost), len(shapes.modes), shapes.mean.shape[1]
     slopes = np.zeros((frames, count + 6, 2, points))
-    cameras = poses.scales[:, None, None] * poses.rotations[:, :2]
+    cameras = projections_of(poses.rotations, poses.scales)
     modes = cameras @ shapes.modes.transpose(1, 0, 2).reshape(3, -1)
     slopes[:, :count] = modes.reshape(frames, 2, count, points).transpose(0, 2, 1, 3)
     slopes[:, count, 0] = slopes[:, count + 1, 1] = 1.0

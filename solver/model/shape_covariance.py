@@ -24,6 +24,7 @@ from pliant.solver.model.marginal_likelihood import root_matrix
 from pliant.solver.model.random_walk import random_walk, random_walk_at, walk_bands, walked
 from pliant.solver.operators.gauss_markov import PathPrior
 from pliant.solver.records import Floats
+from pliant.solver.tracks.frame_selection import between
 from scipy import linalg
 
 AXIS_VARIANCE_FLOOR = 1e-3
@@ -121,11 +122,17 @@ class ShapeCovariance:
         )
         return basis, PathPrior.of(chain * (norm / self.walk_variance), (first, second, third))
 
+    def turned(self, axes: Floats) -> ShapeCovariance:
+        """Return the covariance of the coordinates `axes` x, for a 3×3 matrix: a rotation, a reflection or a stretch."""
+        return replace(
+            self,
+            mean_covariance=axes @ self.mean_covariance @ axes.T,
+            axis_covariance=axes @ self.axis_covariance @ axes.T,
+        )
+
     def stretched(self, used: NDArray[np.intp], num_frames: int) -> ShapeCovariance:
         """Return the covariance of all `num_frames` frames when this one covers the frames `used`.
 
         Modes are interpolated linearly between them, the conditional mean of a random walk.
         """
-        every = np.arange(num_frames)
-        modes = [np.interp(every, used, mode) for mode in self.modes.T]
-        return replace(self, modes=np.stack(modes, axis=1) if modes else np.zeros((num_frames, 0)))
+        return replace(self, modes=between(used, self.modes, num_frames))

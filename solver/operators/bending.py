@@ -10,10 +10,8 @@ single precision 156 and 52 + 22.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.operators.mesh_laplacian import Laplacian
-
-Array = NDArray[np.floating]
+from pliant.solver.records import Array
 
 TOGETHER = 8
 """Maximum number of frames multiplied together: 24 vectors."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.records import Floats
 
 
@@ -22,8 +21,3 @@ def difference_bands(num_frames: int, order: int) -> Floats:
         for k in range(order + 1):
             bands[k, start : start + order + 1 - k] += stencil[: order + 1 - k] * stencil[k:]
     return bands
-
-
-def differences(shapes: NDArray[np.floating], order: int) -> NDArray[np.floating]:
-    """Return H X for X of shape `(F, 3, P)`."""
-    return np.diff(shapes, n=min(order, len(shapes) - 1), axis=0)

@@ -14,12 +14,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from pliant.solver.records import Floats
+from pliant.solver.records import Array, Floats
 from pliant.solver.threads import SMALLEST, over_ranges
 from scipy import linalg
-
-Array = NDArray[np.floating]
 
 POINT_BLOCK = 1024
 """Number of points per unit of parallel work."""
@@ -54,12 +51,6 @@ class PathPrior:
         """Return Q_c with the modes in another precision."""
         first, second, third = (each.astype(kind) for each in self.modes)
         return PathPrior(self.bands, (first, second, third))
-
-    def matrices(self) -> Floats:
-        """Return all Q_c as dense matrices, shape `(3, F, F)`."""
-        frames = self.bands.shape[1]
-        chain = _chained(self.bands, np.eye(frames))
-        return np.stack([chain - each.astype(np.float64) @ each.T.astype(np.float64) for each in self.modes])
 
     def subtract_modes(self, shapes: Array, result: Array) -> None:
         """Subtract V_c V_cᵀ X_c from each coordinate c of the result; the operator's stencil applies B."""

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.mesh import Mesh
-from pliant.solver.operators.aggregation import Level, build_levels
+from pliant.solver.operators.aggregation import Level, Matrix, build_levels
 from pliant.solver.records import Floats, Ints
 from scipy import sparse
 
-Matrix = sparse.csr_array[Any]
 STRENGTH = 12.0
 """Factor that scales the mean of the neighbours minus the vertex, h²∇²/4 for neighbours in all directions, to 3 h²∇²."""
 

@@ -14,14 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.operators.bending import add_bending, frames_together
 from pliant.solver.operators.gauss_markov import PathPrior
 from pliant.solver.operators.mesh_laplacian import Laplacian
-from pliant.solver.records import Floats
+from pliant.solver.records import Array, Floats
 from pliant.solver.threads import SMALLEST, over_ranges
-
-Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,12 +10,13 @@ from pliant.solver.agreement import check_agreement, seen_again
 from pliant.solver.cameras import estimation
 from pliant.solver.cameras.estimation import CameraEstimate, given_cameras
 from pliant.solver.cameras.planar_ambiguity import is_planar
+from pliant.solver.evaluation.trust import turned
 from pliant.solver.limits import LEARNED_FRAMES, learned_stride
-from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.model.expectation_maximisation import ModelOrder
 from pliant.solver.monitor import Monitor, enter
-from pliant.solver.pulse import pulses_to
+from pliant.solver.pulse import ShouldStop, pulses_to
 from pliant.solver.reconstruction.long_films import extended
-from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, monitored, observe
+from pliant.solver.reconstruction.observations import Observations, OnStep, monitored, observe
 from pliant.solver.records import MIN_POINTS, Camera, Floats, KnownCamera, Step, Tracks
 from pliant.solver.refinement.covariance_learning import LearningData, learn_covariance
 from pliant.solver.refinement.depth_rounds import correct_perspective
@@ -33,6 +34,9 @@ STAGES = (
     "completion", "multistart", "model_order", "starts", "perspective", "scales", "refinement", "observations",
     "covariance", "extension",
 )  # fmt: skip
+
+MIN_CAMERA_TURN = 10.0
+"""Largest angle between two viewing directions, degrees, below which the cameras carry a warning."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -127,10 +131,19 @@ def cameras_of(observations: Observations, monitor: Monitor) -> Cameras:
         assert data is not None
         estimate, covariance = learn_covariance(estimate, data, seed=settings.seed, should_stop=monitor)
         estimate, data = extended(estimate, covariance, used, observations, should_stop=monitor)
+    if observations.known is None:
+        estimate = replace(estimate, warnings=turn_warnings(estimate.rotations))
     return Cameras(
         camera_of(estimate, observations), estimate.outliers, estimate.reasons, estimate.warnings, monitor.stopped,
         estimate, data, observations,
     )  # fmt: skip
+
+
+def turn_warnings(rotations: Floats) -> tuple[str, ...]:
+    """Return a warning if estimated rotations `(F, 3, 3)` hardly differ; a roll about the viewing direction shows no depth."""
+    if turned(rotations) >= MIN_CAMERA_TURN:
+        return ()
+    return ("The camera hardly turns around the object: the tracks do not determine depth. Treat it as a guess.",)
 
 
 def _without_outliers(
@@ -173,7 +186,7 @@ def _with_shapes(
             monitor.expect([stage_of("observations", len(shown))], before="covariance")
         # The pose signs of a plane are weakly determined; completed outliers are enough to flip them.
         corrupted_plane = estimate.outliers > OUTLIER_SHARE and is_planar(estimate.gram)
-        scaled = observations.turning or (known is not None and known.scales is None)
+        scaled = observations.turning or (known is not None and observations.known_scales is None)
         scaled = scaled and settings.estimates_scales and not (known is None and corrupted_plane)
         estimate, data = refine_cameras(
             estimate, normalized, shown, turning=observations.turning and not corrupted_plane, estimates_scales=scaled,
@@ -183,9 +196,7 @@ def _with_shapes(
         used = np.flatnonzero(shown)
         some = used[evenly_spread(len(used), LEARNED_FRAMES)]
         how = Refinement(ModelOrder(ordered=estimate.ordered), turning=observations.turning, should_stop=monitor)
-        estimate = correct_perspective(
-            Evidence.of(estimate, normalized, some, np.asarray(estimate.scales)), how
-        ).estimate
+        estimate = correct_perspective(Evidence.of(estimate, normalized, some, estimate.scales), how).estimate
     return estimate, data
 
 
@@ -211,7 +222,7 @@ def camera_of(estimate: CameraEstimate, observations: Observations) -> Camera:
     camera = Camera(
         np.array(estimate.rotations, dtype=np.float64),
         np.array(estimate.scales, dtype=np.float64) * observations.world_scale,
-        normalized.centroid + normalized.unit * np.asarray(estimate.translations),
+        normalized.centroid + normalized.unit * estimate.translations,
         y_up=observations.settings.y_up,
     )
     if view is not None:

@@ -8,20 +8,20 @@ a factor of their Gram matrix, which is never formed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import Perspective, corrected, depth_map
-from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.model.expectation_maximisation import ModelOrder
 from pliant.solver.model.resection import MeanShapes, Poses, Views, interpolated, predicted, resected
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import angles_between, start_at_identity
 from pliant.solver.monitor import enter
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.reconstruction.observations import Observations
-from pliant.solver.records import Floats, read_only
+from pliant.solver.records import Floats, mean_scale, projections_of, read_only
 from pliant.solver.refinement.covariance_learning import LearningData
 from pliant.solver.refinement.learned import Learned, Refinement
 from pliant.solver.tracks.completion import Filling, gross
@@ -37,7 +37,7 @@ def extended(
     used: NDArray[np.intp],
     observations: Observations,
     *,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> tuple[CameraEstimate, LearningData]:
     """Return cameras and covariance of all frames of a film.
 
@@ -57,16 +57,16 @@ def extended(
     enter(should_stop, "extension")
     frames = len(observations.normalized.points)
     turning = observations.turning
-    scales, thin = np.asarray(estimate.scales), np.asarray(estimate.rotations)
-    with_scales = bool((scales != 1).any()) and not _has_scales(observations)
-    shapes = MeanShapes.of(covariance, thin, scales, np.asarray(estimate.sample))
+    scales, thin = estimate.scales, estimate.rotations
+    with_scales = bool((scales != 1).any()) and observations.known_scales is None
+    shapes = MeanShapes.of(covariance, thin, scales, estimate.sample)
     chosen = estimate.sampled
     views = _views(observations, estimate, chosen)
     poses = interpolated(used, thin, scales, covariance.modes, frames)
     if observations.known is not None:
         poses = replace(poses, rotations=np.array(observations.known.rotations))
-        if _has_scales(observations):
-            poses = replace(poses, scales=np.array(observations.known.scales))
+        if observations.known_scales is not None:
+            poses = replace(poses, scales=np.array(observations.known_scales))
     begun = poses.rotations
     poses = resected(views, shapes, poses, turning=turning, with_scales=with_scales, should_stop=should_stop)
     if turning:
@@ -74,13 +74,9 @@ def extended(
         start = Learned(poses.rotations, poses.scales, replace(covariance, modes=poses.coefficients), np.inf)
         how = Refinement(with_scales=with_scales, should_stop=should_stop)
         moved = how.refine_once(np.zeros((0, 0)), start, factor=columns(sample) / sample.shape[1] ** 0.5)
-        poses = replace(poses, rotations=moved.rotations, scales=moved.scales * np.exp(np.log(poses.scales).mean()))
+        poses = replace(poses, rotations=moved.rotations, scales=moved.scales * mean_scale(poses.scales))
         poses = resected(views, shapes, poses, turning=False, with_scales=False, should_stop=should_stop)
     return _whole(estimate, covariance, observations, views, shapes, poses, begun)
-
-
-def _has_scales(observations: Observations) -> bool:
-    return observations.known is not None and observations.known.scales is not None
 
 
 def _views(observations: Observations, estimate: CameraEstimate, chosen: NDArray[np.intp]) -> Views:
@@ -125,7 +121,7 @@ def _whole(
     begun: Floats,
 ) -> tuple[CameraEstimate, LearningData]:
     """Return the estimate of all frames, with an estimated first rotation set to the identity, and its covariance as learning data."""
-    size = 1.0 if _has_scales(observations) else float(np.exp(np.log(poses.scales).mean()))
+    size = mean_scale(poses.scales) if observations.known_scales is None else 1.0
     scales = poses.scales / size
     first = poses.rotations[0] if observations.known is None else np.eye(3)
     rotations = start_at_identity(poses.rotations) if observations.known is None else poses.rotations
@@ -151,8 +147,8 @@ def _whole(
         perspective=_perspective(estimate, observations, views, shapes, poses, whole, rotations, scales, filling),
     )  # fmt: skip
     data = LearningData(
-        np.zeros((0, 0)), sample, rotations[:, :2] * scales[:, None, None], np.arange(len(rotations)),
-        ModelOrder(ordered=covariance.ordered), stopped=whole,
+        np.zeros((0, 0)), sample, projections_of(rotations, scales), np.arange(len(rotations)),
+        ModelOrder(ordered=covariance.ordered), covariance=whole,
         rotations=rotations, scales=scales, turned=False,
     )  # fmt: skip
     return estimate, data
@@ -173,7 +169,7 @@ def _filling(
     covariance: ShapeCovariance, rotations: Floats, scales: Floats, poses: Poses, shapes: MeanShapes
 ) -> Filling:
     """Return the low-rank factor that predicts hidden entries of any point: the images of the covariance's columns."""
-    images = covariance.image_model(rotations[:, :2] * scales[:, None, None]).columns.reshape(len(rotations), 2, -1)
+    images = covariance.image_model(projections_of(rotations, scales)).columns.reshape(len(rotations), 2, -1)
     basis = np.concatenate([images, poses.translations[:, :, None]], axis=2)
     return Filling(basis, np.eye(images.shape[2]), shapes.variance**0.5)
 

@@ -12,13 +12,13 @@ from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.errors import InvalidInput
 from pliant.solver.limits import frame_chunks
 from pliant.solver.monitor import Monitor
-from pliant.solver.records import Floats, KnownCamera, Step, Tracks
+from pliant.solver.pulse import ShouldStop
+from pliant.solver.records import Floats, KnownCamera, Step, Tracks, mean_scale
 from pliant.solver.settings import Settings
 from pliant.solver.stages import planned, unseen_frames
 from pliant.solver.tracks.normalization import Normalized, normalize, relative
 
 OnStep = Callable[[Step], None]
-ShouldStop = Callable[[], bool]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +48,11 @@ class Observations:
     def turning(self) -> bool:
         """Whether rotations are estimated and refined."""
         return self.known is None and self.settings.refine_rotations
+
+    @property
+    def known_scales(self) -> Floats | None:
+        """The given scales; None if they are estimated."""
+        return None if self.known is None else self.known.scales
 
     def without(self, outliers: NDArray[np.bool_]) -> Observations:
         """Return the observations with `outliers`, shape `(F, P)`, hidden, so that they do not affect unit and centroids."""
@@ -98,11 +103,6 @@ class Observations:
                 got=f"{self.tracks.num_frames}", hint="Estimate the cameras from tracks of the same frames.",
             )  # fmt: skip
         return replace(self, tracks=tracks, normalized=in_units_of(self.normalized, tracks))
-
-
-def mean_scale(scales: Floats) -> float:
-    """Return the geometric mean of positive scales `(F,)`."""
-    return float(np.exp(np.log(scales).mean()))
 
 
 def in_units_of(normalized: Normalized, tracks: Tracks) -> Normalized:

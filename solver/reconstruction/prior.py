@@ -11,9 +11,9 @@ from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.errors import InvalidInput
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor
-from pliant.solver.pulse import pulses_to
+from pliant.solver.pulse import ShouldStop, pulses_to
 from pliant.solver.reconstruction.cameras import STAGES, Cameras, cameras_of
-from pliant.solver.reconstruction.observations import OnStep, ShouldStop, monitored
+from pliant.solver.reconstruction.observations import OnStep, monitored
 from pliant.solver.records import Floats, KnownCamera, Step, Tracks
 from pliant.solver.refinement.covariance_learning import learn_covariance
 from pliant.solver.refinement.depth_rounds import with_depth_map
@@ -163,14 +163,14 @@ def estimate_with(cameras: Cameras, prior: Prior) -> CameraEstimate:
     if prior.estimate.rotations is cameras.estimate.rotations:
         return prior.estimate
     reasons = {**cameras.estimate.reasons, "modes": prior.reason}
-    rotations, scales = np.asarray(cameras.estimate.rotations), np.asarray(cameras.estimate.scales)
+    rotations, scales = cameras.estimate.rotations, cameras.estimate.scales
     if np.array_equal(rotations, prior.estimate.rotations) and np.array_equal(scales, prior.estimate.scales):
         return replace(prior.estimate, reasons=reasons, warnings=cameras.warnings)  # with completed tracks
     estimate = replace(cameras.estimate, reasons=reasons)
     return with_depth_map(estimate, prior.normalized, rotations, scales)
 
 
-def changes_of(tracks: Tracks, cameras: Cameras, prior: Prior, *, seed: int, should_stop: ShouldStop | None) -> Changes:
+def changes_of(tracks: Tracks, cameras: Cameras, prior: Prior, *, seed: int, should_stop: ShouldStop) -> Changes:
     """Return the jackknife result of the tracks that the cameras were estimated from.
 
     Parameters
@@ -183,7 +183,7 @@ def changes_of(tracks: Tracks, cameras: Cameras, prior: Prior, *, seed: int, sho
         Learned with the cameras.
     seed : int
         Seed of the folds of early stopping.
-    should_stop : callable, optional
+    should_stop : callable
         Called between refinements.
     """
     estimate, own = estimate_with(cameras, prior), cameras.observations.normalized

@@ -139,7 +139,7 @@ def _finished(
     covariance = start.covariance if problem.weights.temporal > 0 else None
     solution = assessed(
         solution, tracks, confidence, estimate, covariance, normalized.unit,
-        turning=observations.turning, free_scales=observations.known is None or observations.known.scales is None,
+        turning=observations.turning, free_scales=observations.known_scales is None,
         seed=start.settings.seed, connected=start.part is not None or problem.weights.spatial > 0, changes=changes,
         centred=problem.moving, should_stop=monitor,
     )  # fmt: skip

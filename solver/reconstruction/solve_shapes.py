@@ -9,10 +9,10 @@ import numpy as np
 from pliant.solver.agreement import check_mesh
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
-from pliant.solver.pulse import pulses_to
+from pliant.solver.pulse import ShouldStop, pulses_to
 from pliant.solver.reconstruction.blocks import needs_blocks, shapes_in_blocks
 from pliant.solver.reconstruction.cameras import Cameras
-from pliant.solver.reconstruction.observations import OnStep, ShouldStop, monitored
+from pliant.solver.reconstruction.observations import OnStep, monitored
 from pliant.solver.reconstruction.prior import Prior, changes_of
 from pliant.solver.reconstruction.shapes import shapes_from
 from pliant.solver.reconstruction.solution import in_world_unit

@@ -14,9 +14,9 @@ from pliant.solver.errors import InvalidInput, InvalidSettings
 from pliant.solver.mesh import Mesh
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor
-from pliant.solver.pulse import pulses_to
+from pliant.solver.pulse import ShouldStop, pulses_to
 from pliant.solver.reconstruction.cameras import Cameras
-from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, monitored
+from pliant.solver.reconstruction.observations import Observations, OnStep, monitored
 from pliant.solver.reconstruction.prior import Prior, estimate_with
 from pliant.solver.records import Choices, Floats, Step, Tracks
 from pliant.solver.settings import Settings
@@ -110,7 +110,7 @@ def find_outliers(
     used = cameras.observations.settings if settings is None else settings
     monitor = monitored(tracks, None, used, on_step, should_stop, only=("shapes",))
     with pulses_to(monitor.pulse):
-        found = begin(tracks, cameras, prior, mesh, settings, monitor).rejected()
+        found = begin(tracks, cameras, prior, mesh, used, monitor).rejected()
     monitor.report(Step("finish", 1.0))
     return found
 
@@ -120,7 +120,7 @@ def begin(
     cameras: Cameras,
     prior: Prior | None,
     mesh: Mesh | None,
-    settings: Settings | None,
+    settings: Settings,
     monitor: Monitor,
     *,
     shapes: Floats | None = None,
@@ -132,7 +132,7 @@ def begin(
     The initial shapes are `shapes`, if given, and least-squares ones otherwise.
     """
     start = prepared(tracks, cameras, prior, mesh, settings, moving=moving, bending=bending, should_stop=monitor)
-    start = _with_outlier_reason(_with_outliers_rejected(start, monitor))
+    start = _without_outliers(start, monitor)
     return start if shapes is None else warm(start, shapes)
 
 
@@ -141,11 +141,11 @@ def prepared(
     cameras: Cameras,
     prior: Prior | None,
     mesh: Mesh | None,
-    settings: Settings | None,
+    settings: Settings,
     *,
     moving: bool,
     bending: float | None = None,
-    should_stop: ShouldStop | None = None,
+    should_stop: ShouldStop,
 ) -> Start:
     """Return the start of the minimisation, before outlier rejection; less converged once `should_stop` returns True.
 
@@ -159,64 +159,47 @@ def prepared(
         The settings select another prior than the given one.
     """
     observations = cameras.observations.of(tracks)
-    settings = observations.settings if settings is None else settings
     check_mesh(tracks, mesh, settings)
     if prior is None:
         estimate, covariance = cameras.estimate, None
         settings = without_learned_prior(settings)
-    elif settings.gaussian:
-        estimate, covariance = estimate_with(cameras, prior), prior.normalized
     else:
-        raise InvalidSettings(
-            "invalid_option", field="settings.prior", expected="gaussian, with method robust and preset auto, with a learned prior",
-            got=f"prior {settings.prior}, method {settings.method}, preset {settings.preset}",
-            hint="Pass prior=None for the priors that are not learned.",
-        )  # fmt: skip
-    if len(estimate.rotations) != tracks.num_frames or (
-        covariance is not None and len(covariance.modes) != tracks.num_frames
-    ):
-        raise InvalidInput(
-            "camera_mismatch", field="prior", expected=f"a prior of {tracks.num_frames} frames, as many as the tracks have",
-            got=f"{0 if covariance is None else len(covariance.modes)}", hint="Learn the prior from tracks of the same frames.",
-        )  # fmt: skip
+        _check_prior(prior, tracks, settings)
+        estimate, covariance = estimate_with(cameras, prior), prior.normalized
     flat = orthographic(observations.normalized, estimate.perspective)
-    return _begun(
-        observations, mesh, settings, flat, estimate, covariance, cameras.outliers,
-        moving=moving, bending=bending, should_stop=should_stop,
-    )  # fmt: skip
-
-
-def _begun(
-    observations: Observations,
-    mesh: Mesh | None,
-    settings: Settings,
-    flat: Normalized,
-    estimate: CameraEstimate,
-    covariance: ShapeCovariance | None,
-    outliers: float,
-    *,
-    moving: bool,
-    bending: float | None,
-    should_stop: ShouldStop | None,
-) -> Start:
-    tick = should_stop if should_stop is not None else bool
-    tick()
+    should_stop()
     part = None if covariance is None or settings.temporal_weight == 0 else well_observed(flat, mesh)
     if part is None:
         problem, choices = build_problem(flat, estimate, mesh, settings, covariance)
     else:
         problem, choices = build_problem(part.normalized, estimate, part.mesh, settings, covariance)
     problem = replace(problem, moving=moving)
-    tick()
+    should_stop()
     state = _initial(problem, estimate, settings, should_stop)
-    tick()
+    should_stop()
     return Start(
-        observations, mesh, settings, flat, estimate, covariance, outliers, part,
+        observations, mesh, settings, flat, estimate, covariance, cameras.outliers, part,
         *with_bending(problem, choices, state, settings, bending=bending),
     )  # fmt: skip
 
 
-def _initial(problem: Problem, estimate: CameraEstimate, settings: Settings, should_stop: ShouldStop | None) -> State:
+def _check_prior(prior: Prior, tracks: Tracks, settings: Settings) -> None:
+    """Check that a learned prior is what the settings select, and has as many frames as the tracks."""
+    if not settings.gaussian:
+        raise InvalidSettings(
+            "invalid_option", field="settings.prior", expected="gaussian, with method robust and preset auto, with a learned prior",
+            got=f"prior {settings.prior}, method {settings.method}, preset {settings.preset}",
+            hint="Pass prior=None for the priors that are not learned.",
+        )  # fmt: skip
+    frames = len(prior.normalized.modes)
+    if frames != tracks.num_frames:
+        raise InvalidInput(
+            "camera_mismatch", field="prior", expected=f"a prior of {tracks.num_frames} frames, as many as the tracks have",
+            got=f"{frames}", hint="Learn the prior from tracks of the same frames.",
+        )  # fmt: skip
+
+
+def _initial(problem: Problem, estimate: CameraEstimate, settings: Settings, should_stop: ShouldStop) -> State:
     translations = np.array(estimate.translations, dtype=np.float64)
     if settings.method == "pseudo_inverse":
         return init(problem, pseudo_inverse(problem, translations), translations)
@@ -260,28 +243,21 @@ def without_learned_prior(settings: Settings) -> Settings:
     return replace(settings, prior="smooth", order="film") if settings.gaussian else settings
 
 
-def _with_outliers_rejected(start: Start, monitor: Monitor) -> Start:
-    """Return the start without gross outliers; unchanged without a learned prior or with hardly any outliers."""
-    problem, covariance, filling = start.problem, start.covariance, start.estimate.filling
-    if covariance is None or filling is None or problem.weights.temporal == 0 or start.outliers <= OUTLIER_SHARE:
+def _without_outliers(start: Start, monitor: Monitor) -> Start:
+    """Return the start without gross outliers, and with a sentence on their share; unchanged without a learned prior or with hardly any."""
+    problem, covariance, filling, estimate = start.problem, start.covariance, start.estimate.filling, start.estimate
+    if covariance is None or problem.weights.temporal == 0 or start.outliers <= OUTLIER_SHARE:
         return start
-    estimate = start.estimate
-    found = gross_outliers(
-        start.flat if start.part is None else start.part.normalized,
-        np.asarray(estimate.rotations)[:, :2] * np.asarray(estimate.scales)[:, None, None],
-        np.asarray(estimate.translations), covariance, filling, share=start.outliers, should_stop=monitor,
-    )  # fmt: skip
-    without = replace(problem, confidence=np.where(found, 0, problem.confidence).astype(problem.confidence.dtype))
-    return replace(start, problem=without, state=init(without, start.state.shapes, start.state.translations))
-
-
-def _with_outlier_reason(start: Start) -> Start:
-    """Return the start with a sentence on the share of rejected observations, if outliers were searched for."""
-    outliers = start.outliers
-    if start.covariance is None or start.problem.weights.temporal == 0 or outliers <= OUTLIER_SHARE:
-        return start
+    if filling is not None:
+        found = gross_outliers(
+            start.flat if start.part is None else start.part.normalized,
+            estimate.projections,
+            estimate.translations, covariance, filling, share=start.outliers, should_stop=monitor,
+        )  # fmt: skip
+        without = replace(problem, confidence=np.where(found, 0, problem.confidence).astype(problem.confidence.dtype))
+        start = replace(start, problem=without, state=init(without, start.state.shapes, start.state.translations))
     seen = int(np.count_nonzero(start.observations.tracks.visible))
-    reason = outlier_reason(seen - int(np.count_nonzero(start.confidence())), seen, outliers)
+    reason = outlier_reason(seen - int(np.count_nonzero(start.confidence())), seen, start.outliers)
     return replace(start, choices=replace(start.choices, reasons={**start.choices.reasons, "outliers": reason}))
 
 

@@ -61,7 +61,7 @@ def combinations(
         yield "with preset paper without low_rank_weight", ("prior",)
     if settings.loss == "l2":
         yield "with loss l2", ("robust_scale",)
-    if settings.camera in ("orthographic", "scaled_orthographic"):
+    if settings.is_orthographic:
         yield f"with camera {settings.camera}", ("principal_point",)
     elif settings.camera == "auto" and settings.focal_length is None and not (settings.gaussian or known_cameras):
         yield "with camera auto, which finds perspective only with prior gaussian", ("principal_point",)

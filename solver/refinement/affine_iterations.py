@@ -23,7 +23,7 @@ from pliant.solver.refinement.focal_length import (
     refine_with_focal,
 )
 from pliant.solver.refinement.learned import Learned, Refinement
-from pliant.solver.tracks.matrix import centred, columns
+from pliant.solver.tracks.matrix import centred, columns, gram_of
 
 SIZES = (2, 5)
 """K of the factorizations. A rigid object (K = 1) deforms too little to need them; with 3 and 8 as well, errors are about the same."""
@@ -73,7 +73,7 @@ def affine_iterations(
     first = FIRST_CURVATURE if view.given is None else view.given
     trials: list[_Trial] = []
     for size in SIZES:
-        if how.stopped() or 3 * size > min(2 * len(used), views.shape[1]):
+        if how.should_stop() or 3 * size > min(2 * len(used), views.shape[1]):
             break
         start = part.factorized(size)
         trials += [part.iterated(size, sign * first, start) for sign in view.signs]
@@ -138,6 +138,6 @@ class _Iterations:
 
     def _factorized(self, images: Floats, size: int, like: Floats) -> Learned:
         rows = columns(centred(images)) / np.repeat(self.scales, 2)[:, None]
-        rotations = upgrade(rows @ rows.T / rows.shape[1], size).rotations
+        rotations = upgrade(gram_of(rows), size).rotations
         turned = aligned(rotations, like, np.arange(len(images)))
         return self.how.anneal(images, turned, self.scales, iterations=SEARCH_EM_ROUNDS)

@@ -107,7 +107,7 @@ def bulges(found: Learned, sample: Floats, *, y_up: bool) -> bool:
         Whether y points up in the images, and z therefore toward the camera.
     """
     frames = len(sample)
-    rows = (found.rotations[:, :2] * found.scales[:, None, None]).reshape(2 * frames, 3)
+    rows = found.projections.reshape(2 * frames, 3)
     rigid = np.linalg.pinv(rows) @ columns(sample)
     toward = _decomposed(found.rotations)[0]
     depth = (toward @ rigid) * (-1 if y_up else 1)
@@ -136,13 +136,11 @@ def _decomposed(rotations: Floats) -> tuple[Floats, Floats, Floats]:
 def _stretched(found: Learned, stretch: float, toward: Floats, rolls: Floats, tilts: Floats) -> Learned:
     """Return cameras and covariance with depth along d multiplied and tilts divided by λ."""
     along = np.eye(3) + (stretch - 1) * np.outer(toward, toward)
-    covariance = found.covariance
-    deformation = along @ covariance.axis_covariance @ along.T
-    size = float(np.trace(deformation)) / 3
+    covariance = found.covariance.turned(along)
+    size = float(np.trace(covariance.axis_covariance)) / 3
     changed = replace(
         covariance,
-        mean_covariance=along @ covariance.mean_covariance @ along.T,
-        axis_covariance=deformation / size,
+        axis_covariance=covariance.axis_covariance / size,
         modes=covariance.modes * size**0.5,
         walk_variance=covariance.walk_variance * size,
     )

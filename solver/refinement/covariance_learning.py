@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.model.early_stopping import described, learn_with_early_stopping
-from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.model.expectation_maximisation import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import enter
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.refinement.depth_rounds import with_depth_map
 
@@ -34,8 +34,8 @@ class LearningData:
 
     model_order: ModelOrder
 
-    stopped: ShapeCovariance | None
-    """Covariance of an interrupted refinement, used unchanged; None to learn one."""
+    covariance: ShapeCovariance | None
+    """Already learned, with an interrupted refinement or the cameras of a long film; None to learn one."""
 
     rotations: Floats
     """Cameras of all frames in the axes of `projections`, shape `(F, 3, 3)`."""
@@ -48,7 +48,7 @@ class LearningData:
 
 
 def learn_covariance(
-    estimate: CameraEstimate, data: LearningData, *, seed: int = 0, should_stop: Callable[[], bool] | None = None
+    estimate: CameraEstimate, data: LearningData, *, seed: int = 0, should_stop: ShouldStop = never
 ) -> tuple[CameraEstimate, ShapeCovariance]:
     """Return the shape covariance of all frames for fixed cameras, and the estimate with the depths that follow from it.
 
@@ -63,8 +63,8 @@ def learn_covariance(
     should_stop : callable, optional
         Called between rounds of EM; once it returns True, the best covariance so far is returned.
     """
-    if data.stopped is not None:
-        covariance, modes = data.stopped, described(data.stopped)
+    if data.covariance is not None:
+        covariance, modes = data.covariance, described(data.covariance)
     else:
         # Learn from scratch: modes learned along the way to these cameras overstate their likelihood.
         enter(should_stop, "covariance")
@@ -76,13 +76,4 @@ def learn_covariance(
     estimate = with_depth_map(
         replace(estimate, reasons={**estimate.reasons, "modes": modes}), covariance, data.rotations, data.scales
     )
-    return estimate, _seen_from(covariance, data.rotations[0]) if data.turned else covariance
-
-
-def _seen_from(covariance: ShapeCovariance, first: Floats) -> ShapeCovariance:
-    """Return the covariance in the axes of the first camera."""
-    return replace(
-        covariance,
-        mean_covariance=first @ covariance.mean_covariance @ first.T,
-        axis_covariance=first @ covariance.axis_covariance @ first.T,
-    )
+    return estimate, covariance.turned(data.rotations[0]) if data.turned else covariance

@@ -16,20 +16,19 @@ from pliant.solver.cameras.factorization import upgrades
 from pliant.solver.cameras.multistart import CANDIDATES
 from pliant.solver.cameras.perspective import Perspective, corrected, depths_of
 from pliant.solver.model.so3 import MIRROR, nearest
+from pliant.solver.pulse import never
 from pliant.solver.records import Floats
 from pliant.solver.refinement.focal_length import refine_with_focal
 from pliant.solver.refinement.learned import Learned, Refinement
+from pliant.solver.refinement.starts import START_FRAMES
 from pliant.solver.tracks.frame_selection import evenly_spread
-from pliant.solver.tracks.matrix import centred, columns
+from pliant.solver.tracks.matrix import centred, columns, gram_of
 
 ALTERNATION_ROUNDS = 3
 """Updates of depths, covariance, cameras and κ each time that cameras were found or refined."""
 
 ALTERNATION_EM_ROUNDS = 60
 """EM rounds per update."""
-
-COMPARED_FRAMES = 40
-"""Frames on which the cameras of factorizations are compared, as in `starts.START_FRAMES`."""
 
 
 def alternate(
@@ -57,7 +56,7 @@ def alternate(
     """
     views = view.learning_sample[used]
     for _ in range(rounds):
-        if how.stopped():
+        if how.should_stop():
             break
         try:
             found = _relearned(views, view.curvature, found, how)
@@ -90,7 +89,7 @@ def refactorize(
     how : Refinement
         What the comparison refines; must turn.
     """
-    places = evenly_spread(len(used), COMPARED_FRAMES)
+    places = evenly_spread(len(used), START_FRAMES)
     some = used[places]
     part = replace(
         found, rotations=found.rotations[places], scales=found.scales[places], energy=np.inf,
@@ -98,16 +97,16 @@ def refactorize(
     )  # fmt: skip
 
     def energy(start: Learned) -> float:
-        moved, _ = alternate(view, start, some, replace(how, should_stop=None), rounds=1)
+        moved, _ = alternate(view, start, some, replace(how, should_stop=never), rounds=1)
         return moved.energy
 
     turns = towards(view.learning_sample.mean(axis=1), view.curvature)
     rows = columns(_turned(view, turns) / scales[:, None, None])
-    gram = rows @ rows.T / rows.shape[1]
+    gram = gram_of(rows)
     limit = min(len(gram) // 3, view.learning_sample.shape[1] // 3)
     best, lowest = None, energy(part)
     for each in upgrades(gram, [size for size in CANDIDATES if size <= limit]):
-        if how.stopped():
+        if how.should_stop():
             break
         rotations = turns.transpose(0, 2, 1) @ aligned(each.rotations, turns[used] @ found.rotations, used)
         reached = energy(replace(part, rotations=rotations[some]))

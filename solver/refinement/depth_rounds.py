@@ -67,7 +67,7 @@ def _correct_from(evidence: Evidence, found: Learned, view: Perspective, how: Re
         turned, covariance = mirrored(found.rotations, found.covariance)
         found = replace(found, rotations=turned, covariance=covariance)
         estimate = evidence.estimate
-        estimate = replace(estimate, rotations=MIRROR @ np.asarray(estimate.rotations) @ MIRROR)
+        estimate = replace(estimate, rotations=MIRROR @ estimate.rotations @ MIRROR)
         evidence = replace(evidence, estimate=estimate)
     found, view = alternate(view, found, evidence.used, how)
     return _with_corrected_tracks(evidence, found, view), found
@@ -132,7 +132,7 @@ def with_depth_map(
 
 def _with_corrected_tracks(evidence: Evidence, found: Learned, view: Perspective) -> Evidence:
     """Return the evidence with the rotations found and the tracks corrected with the depths found; `found` has absolute scales."""
-    every = to_all_frames(found, evidence.used, np.asarray(evidence.estimate.rotations))
+    every = to_all_frames(found, evidence.used, evidence.estimate.rotations)
     view = replace(view, depth=depth_map(every.rotations, every.scales, every.covariance))
     gram, translations, sample = corrected_moments(view, evidence.normalized)
     read_only(every.rotations)

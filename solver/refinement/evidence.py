@@ -56,9 +56,9 @@ class Evidence:
     @property
     def rotations(self) -> Floats:
         """Rotations of the frames used, shape `(F', 3, 3)`."""
-        return np.asarray(self.estimate.rotations)[self.used]
+        return self.estimate.rotations[self.used]
 
     @property
     def projections(self) -> Floats:
         """First two rows of `rotations`, shape `(F', 2, 3)`."""
-        return np.asarray(self.estimate.rotations)[self.used, :2]
+        return self.estimate.rotations[self.used, :2]

@@ -110,12 +110,12 @@ def search(
     used = compared_frames(views)
     comparison = _Comparison.of(views[used], rotations[used], scales[used], how)
     for size, sign in _walk(view, comparison.trials):
-        if how.stopped():
+        if how.should_stop():
             break
         comparison.add(sign * size)
     for _ in range(MAX_POLISHES if view.given is None and _promising(view, comparison.trials) else 0):
         middle = _between(comparison.trials)
-        if middle is None or how.stopped():
+        if middle is None or how.should_stop():
             break
         comparison.add(middle)
     if _promising(view, comparison.trials):
@@ -158,7 +158,7 @@ class _Comparison:
         inwards = [*pairwise(order[: middle + 1]), *pairwise(order[: middle - 1 if middle else None : -1])]
         outwards = [(target, source) for source, target in reversed(inwards)]
         for source, target in inwards + outwards:
-            if self.how.stopped():
+            if self.how.should_stop():
                 return
             found = self._continued(self.trials[source], target)
             if found.nll < self.trials[target].nll:

@@ -78,7 +78,7 @@ def try_free_scales(gram: Floats, rotations: Floats, how: Refinement) -> ScaleTr
             "alone does."
         )
         return ScaleTrial(None, reason, fixed)
-    logs = between(used, logs[:, None], len(rotations))[:, 0]
+    logs = between(used, logs, len(rotations))
     reason = f"Scales {extent} gain {gain:.3f} in the log likelihood per point and frame."
     return ScaleTrial(np.exp(logs - logs.mean()), reason, fixed)
 

@@ -7,7 +7,6 @@ modes, which the random walk replaces); they are refined alternately.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,11 +14,12 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import mirrored
 from pliant.solver.model import full_mode_covariance
-from pliant.solver.model.expectation_maximisation import MAX_MODES
-from pliant.solver.model.model_order import ModelOrder, select_model_order
+from pliant.solver.model.expectation_maximisation import MAX_MODES, ModelOrder
+from pliant.solver.model.model_order import select_model_order
 from pliant.solver.model.resection import rotations_between
 from pliant.solver.model.so3 import MIRROR, angles_between
 from pliant.solver.monitor import enter
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, read_only
 from pliant.solver.refinement.bas_relief import at_probable_depth, bulges, is_typical
 from pliant.solver.refinement.covariance_learning import LearningData
@@ -50,7 +50,7 @@ def refine_cameras(
     estimates_scales: bool = False,
     seed: int = 0,
     y_up: bool = False,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> tuple[CameraEstimate, LearningData]:
     """Return the cameras, refined if `turning`, and the data from which the shape covariance of all frames is learned.
 
@@ -73,7 +73,7 @@ def refine_cameras(
     should_stop : callable, optional
         Called between refinements; once it returns True, the best so far is returned.
     """
-    evidence = Evidence.of(estimate, normalized, np.flatnonzero(shown), np.asarray(estimate.scales))
+    evidence = Evidence.of(estimate, normalized, np.flatnonzero(shown), estimate.scales)
     enter(should_stop, "model_order")
     model_order = select_model_order(
         evidence.sample, evidence.projections, ordered=estimate.ordered, seed=seed, should_stop=should_stop
@@ -97,9 +97,9 @@ def refine_cameras(
     if not evidence.bends and not bulges(found, evidence.sample, y_up=y_up):
         estimate, rotations, found = _mirrored(estimate, rotations, found)
     return estimate, LearningData(
-        evidence.gram, evidence.sample, found.rotations[:, :2] * found.scales[:, None, None], evidence.used, model_order,
-        stopped=None if np.isfinite(found.energy) else found.covariance,
-        rotations=rotations, scales=np.asarray(estimate.scales), turned=True,
+        evidence.gram, evidence.sample, found.projections, evidence.used, model_order,
+        covariance=None if np.isfinite(found.energy) else found.covariance,
+        rotations=rotations, scales=estimate.scales, turned=True,
     )  # fmt: skip
 
 
@@ -115,8 +115,8 @@ def _with_kept_rotations(
         evidence, _ = _of_observations(evidence, found, how)
     estimate = evidence.estimate
     return estimate, LearningData(
-        evidence.gram, evidence.sample, evidence.projections, evidence.used, how.model_order, stopped=None,
-        rotations=np.asarray(estimate.rotations), scales=np.asarray(estimate.scales), turned=False,
+        evidence.gram, evidence.sample, evidence.projections, evidence.used, how.model_order, covariance=None,
+        rotations=estimate.rotations, scales=estimate.scales, turned=False,
     )  # fmt: skip
 
 
@@ -153,7 +153,7 @@ def _with_scale_reason(estimate: CameraEstimate, trial: ScaleTrial) -> CameraEst
 
 def _at_all_frames(used: NDArray[np.intp], scales: Floats, frames: int) -> Floats:
     """Return scales of the frames used, interpolated to all, mean logarithm 0, shape `(F,)`, read-only."""
-    logs = between(used, np.log(scales)[:, None], frames)[:, 0]
+    logs = between(used, np.log(scales), frames)
     found: Floats = np.exp(logs - logs.mean())
     read_only(found)
     return found
@@ -230,7 +230,7 @@ def _of_all_frames(
         estimate = _with_scale_reason(estimate, trial)
     if (found.scales != 1).any():
         estimate = replace(estimate, scales=_at_all_frames(used, found.scales * evidence.start_scales[used], frames))
-    return _with_rotation_reason(estimate, rotations, np.asarray(start.estimate.rotations)), rotations
+    return _with_rotation_reason(estimate, rotations, start.estimate.rotations), rotations
 
 
 def _of_observations(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evidence, Learned]:

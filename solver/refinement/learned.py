@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.model.expectation_maximisation import annealed, learned
+from pliant.solver.model.expectation_maximisation import ModelOrder, annealed, learned
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, fit, metric_of, root_of
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import AXIS_VARIANCE_FLOOR, NOISE_VARIANCE_FLOOR, ShapeCovariance
 from pliant.solver.model.so3 import exponential, logarithm
-from pliant.solver.records import Floats
+from pliant.solver.pulse import ShouldStop, never
+from pliant.solver.records import Floats, projections_of
 from pliant.solver.tracks.frame_selection import between
-from pliant.solver.tracks.matrix import centred, columns
+from pliant.solver.tracks.matrix import centred, columns, gram_of
 
 REFINEMENT_PRIOR_WEIGHT = 0.01
 """Weight of the camera-motion prior: less is needed once the covariance is known."""
@@ -46,6 +45,11 @@ class Learned:
     """Energy of `model.marginal_likelihood`, without a penalty on modes; infinite before the first refinement."""
 
     @property
+    def projections(self) -> Floats:
+        """Shape `(F, 2, 3)`, see `projections_of`."""
+        return projections_of(self.rotations, self.scales)
+
+    @property
     def scaled(self) -> bool:
         """Whether any scale differs from 1."""
         return bool((self.scales != 1).any())
@@ -64,12 +68,8 @@ class Refinement:
     with_scales: bool = False
     """Whether scales are refined; False keeps them at 1."""
 
-    should_stop: Callable[[], bool] | None = None
+    should_stop: ShouldStop = never
     """Called between units of work; once it returns True, the best so far is returned."""
-
-    def stopped(self) -> bool:
-        """Call `should_stop`, if given, and return its answer."""
-        return self.should_stop is not None and self.should_stop()
 
     def learn(self, gram: Floats, rotations: Floats, scales: Floats, *, iterations: int = START_EM_ROUNDS) -> Learned:
         """Return given cameras and a covariance learned for them from scratch, in at most `iterations` EM rounds.
@@ -86,7 +86,7 @@ class Refinement:
             Maximum number of EM rounds.
         """
         covariance = learned(
-            gram, rotations[:, :2] * scales[:, None, None], iterations=iterations, **asdict(self.model_order), should_stop=self.should_stop
+            gram, projections_of(rotations, scales), self.model_order, iterations=iterations, should_stop=self.should_stop
         )  # fmt: skip
         return Learned(rotations, scales, covariance, np.inf)
 
@@ -94,14 +94,14 @@ class Refinement:
         """Return what `learn` returns by annealing alone, without stops, from orthographic tracks `(F, S, 2)`."""
         rows = columns(centred(images))
         covariance = annealed(
-            rows @ rows.T / rows.shape[1], rotations[:, :2] * scales[:, None, None], iterations=iterations, **asdict(self.model_order)
+            gram_of(rows), projections_of(rotations, scales), self.model_order, iterations=iterations
         )  # fmt: skip
         return Learned(rotations, scales, covariance, np.inf)
 
     def refine(self, gram: Floats, found: Learned, *, rounds: int) -> Learned:
         """Return cameras and covariance after `rounds` calls of `refine_once`, fewer after a stop."""
         for _ in range(rounds):
-            if self.stopped():
+            if self.should_stop():
                 break
             found = self.refine_once(gram, found)
         return found
@@ -168,7 +168,7 @@ def to_all_frames(found: Learned, used: NDArray[np.intp], rotations: Floats) -> 
     turns = logarithm(found.rotations @ rotations[used].transpose(0, 2, 1))
     return Learned(
         exponential(between(used, turns, len(rotations))) @ rotations,
-        np.exp(between(used, np.log(found.scales)[:, None], len(rotations))[:, 0]),
+        np.exp(between(used, np.log(found.scales), len(rotations))),
         found.covariance.stretched(used, len(rotations)),
         found.energy,
     )

@@ -8,19 +8,19 @@ L-BFGS on the marginal likelihood as its M-step.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import Perspective, corrected, depth_map
-from pliant.solver.model.expectation_maximisation import learned
+from pliant.solver.model.expectation_maximisation import ModelOrder, learned
 from pliant.solver.model.observation_model import ImageDensity, inlier_probabilities
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.refinement.learned import START_EM_ROUNDS, Learned, Refinement
 from pliant.solver.tracks.completion import often_visible
-from pliant.solver.tracks.matrix import columns, points_of
+from pliant.solver.tracks.matrix import columns, gram_of, points_of
 from pliant.solver.tracks.normalization import Normalized
 
 ROUNDS = 3
@@ -88,7 +88,7 @@ def cross_fitted(
     used: NDArray[np.intp],
     *,
     seed: int,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> tuple[Floats, float]:
     """Return the probability that each observation is an inlier, shape `(F', S)`, and the share of outliers.
 
@@ -107,9 +107,9 @@ def cross_fitted(
     should_stop : callable, optional
         Called between rounds of EM.
     """
-    scales = np.asarray(estimate.scales)[used]
-    projections = np.asarray(estimate.rotations)[used, :2] * scales[:, None, None]
-    points = observed.points - np.asarray(estimate.translations)[used, None]
+    scales = estimate.scales[used]
+    projections = estimate.rotations[used, :2] * scales[:, None, None]
+    points = observed.points - estimate.translations[used, None]
     points = np.where(observed.confidence[..., None] > 0, points, 0.0)
     part = np.random.default_rng(seed).permutation(points.shape[1]) % FOLDS
     found, shares = np.zeros(observed.confidence.shape), []
@@ -117,8 +117,12 @@ def cross_fitted(
         others, own = estimate.sample[used][:, part != fold], part == fold
         rows = columns(others)
         covariance = learned(
-            rows @ rows.T / rows.shape[1], projections, iterations=START_EM_ROUNDS, ordered=estimate.ordered, should_stop=should_stop
-        )  # fmt: skip
+            gram_of(rows),
+            projections,
+            ModelOrder(ordered=estimate.ordered),
+            iterations=START_EM_ROUNDS,
+            should_stop=should_stop,
+        )
         image, weight, share = covariance.of_image(projections), observed.weight[:, own], estimate.outliers
         for _ in range(2):  # the second pass rejects the outliers of the first
             found[:, own], share = inlier_probabilities(
@@ -151,11 +155,11 @@ def on_observations(
     how : Refinement
         What is refined.
     """
-    if how.stopped():
+    if how.should_stop():
         return found, completed
     moments = _expected(observed, found, completed, start_scales)
     for _ in range(ROUNDS):
-        if how.stopped():
+        if how.should_stop():
             break
         found = how.refine_once(moments.gram, found)
         moments = _expected(observed, found, moments, start_scales)
@@ -166,7 +170,7 @@ def _expected(observed: Observed, found: Learned, before: Moments, start_scales:
     """Return the moments under these cameras and this covariance; the tracks are corrected with the depths of `before`."""
     points = _corrected(observed, found, before, start_scales) - before.translations[:, None]
     points = np.where(observed.confidence[..., None] > 0, points / start_scales[:, None, None], 0.0)
-    projections = found.rotations[:, :2] * found.scales[:, None, None]
+    projections = found.projections
     image, noise = found.covariance.of_image(projections), found.covariance.noise_variance
     probability, share = inlier_probabilities(
         image, noise, points, observed.confidence, observed.weight, share=before.outliers

@@ -57,13 +57,13 @@ def best_start(evidence: Evidence, how: Refinement) -> CameraEstimate:
     part, ones = of_frames(evidence.gram, some), np.ones(len(some))
 
     def begun(start: CameraEstimate, margin: float) -> _Trial:
-        given = np.asarray(start.rotations)[evidence.used[some]]
+        given = start.rotations[evidence.used[some]]
         return _Trial(start, margin, how.learn(part, given, ones, iterations=COMPARED_EM_ROUNDS)).refined(part, how)
 
     own, others = begun(estimate, 0.0), []
     for starts, margin in ((estimate.hypotheses, 0.0), (estimate.candidates, MAX_HYPOTHESIS_GAP)):
         for other in starts:
-            if how.stopped():
+            if how.should_stop():
                 return estimate
             others.append(begun(with_other_cameras(estimate, other), margin))
     others.sort(key=lambda trial: trial.energy)
@@ -79,7 +79,7 @@ def best_candidate(evidence: Evidence, found: Learned, how: Refinement) -> Learn
     """
     gram = evidence.gram
     for candidate in evidence.estimate.candidates:
-        if how.stopped():
+        if how.should_stop():
             break
         other = how.learn(gram, candidate.rotations[evidence.used], found.scales)
         other = how.refine(gram, other, rounds=CANDIDATE_ROUNDS)

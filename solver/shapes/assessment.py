@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,7 @@ from pliant.solver.cameras.planar_ambiguity import is_planar, on_one_line
 from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.evaluation.trust import Trust, assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.pulse import pulse
+from pliant.solver.pulse import ShouldStop, never, pulse
 from pliant.solver.records import Camera, Floats, Tracks
 from pliant.solver.refinement.focal_length import more_probable, unclear_perspective
 from pliant.solver.shapes.held_out import held_out_error
@@ -48,7 +47,7 @@ def assessed(
     connected: bool = True,
     changes: Changes | None = None,
     centred: bool = True,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> Solution:
     """Return the solution with the standard deviations of its positions and the verdict on it.
 
@@ -82,18 +81,17 @@ def assessed(
         Called between units of work; once it returns True, the jackknife is skipped.
     """
     std, held_out = None, None
-    tick = should_stop if should_stop is not None else bool
-    tick()
+    should_stop()
     confidence = np.asarray(confidence, dtype=np.float64)
     if covariance is not None:
-        projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2]
+        projections = estimate.projections
         pinhole = Pinhole.of(solution.camera, solution.shapes, unit)
         std = position_std(
             covariance, projections, confidence, noise_std=noise_std(covariance), pinhole=pinhole, seed=seed
         )
         del pinhole
         std *= unit
-        tick()
+        should_stop()
         if connected:
             std = bounded_by_neighbours(std, solution.shapes, confidence)
         if changes is None:
@@ -101,13 +99,13 @@ def assessed(
             changes = learning_changes(
                 estimate, covariance, observed, turning=turning, seed=seed, should_stop=should_stop
             )
-        tick()
+        should_stop()
         np.hypot(std, changes.std_of(solution.shapes, unit, centred=centred), out=std)
         std *= INFLATION
         if free_scales and np.ptp(solution.camera.scales) > 0:
             with_size_std(std, solution.shapes, centred=centred)
         held_out = held_out_error(tracks, solution.shapes, solution.camera, confidence, covariance, unit=unit)
-    tick()
+    should_stop()
     solution = replace(solution, shapes_std=std)
     trust = judged(solution, tracks, confidence, estimate, covariance, unit, held_out_error=held_out)
     return replace(solution, trust=trust)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.evaluation.trust import size_of
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.records import Camera, Floats, Tracks
+from pliant.solver.records import Camera, Floats, Tracks, projections_of
 from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE
 from pliant.solver.tracks.completion import ranks
 from pliant.solver.tracks.frame_selection import evenly_spread
@@ -101,7 +101,7 @@ def held_out_error(
     weights = np.where(weights < LEAST_CONFIDENCE, 0.0, weights)
     images = _corrected(tracks.points[:, chosen], shapes[:, chosen], camera)[used] / unit
     try:
-        image = covariance.of_exact_image((camera.scales[:, None, None] * camera.rotations[:, :2])[used], used)
+        image = covariance.of_exact_image(projections_of(camera.rotations, camera.scales)[used], used)
         errors = _errors(image, noise_std(covariance) ** 2, images, weights)
     except np.linalg.LinAlgError:
         return None

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import count
 
 import numpy as np
-from pliant.solver.energy.problem import Array, Problem
+from pliant.solver.energy.problem import Problem
 from pliant.solver.linear.conjugate_gradient import conjugate_gradient
 from pliant.solver.linear.preconditioner import build_preconditioner
 from pliant.solver.operators.normal_equations import Operator
-from pliant.solver.pulse import pulse
-from pliant.solver.records import Floats
+from pliant.solver.pulse import ShouldStop, never, pulse
+from pliant.solver.records import Array, Floats
 from pliant.solver.shapes.irls import inner_precision
 
 EXACT, ROUGH, MAX_START_ITERATIONS = 1e-4, 0.1, 200
@@ -32,7 +31,7 @@ def pseudo_inverse(problem: Problem, translations: Floats) -> Array:
     return flat
 
 
-def uniform_solution(problem: Problem, translations: Floats, *, should_stop: Callable[[], bool] | None = None) -> Array:
+def uniform_solution(problem: Problem, translations: Floats, *, should_stop: ShouldStop = never) -> Array:
     """Return the least-squares shapes with equal weights for all observations (eq. 5 if λ2 is 0).
 
     They minimise ‖W − R S‖² + λ1 ‖H S‖² + λ2 ‖A S‖²: the result for least squares, the starting point for robust losses.
@@ -40,25 +39,25 @@ def uniform_solution(problem: Problem, translations: Floats, *, should_stop: Cal
     and reweighting would reject it only slowly. `should_stop` is called in every iteration; once it returns True, the shapes so far are
     returned, after at least one iteration.
     """
-    asked, tick = count(), should_stop if should_stop is not None else bool
-    tick()
+    asked = count()
+    should_stop()
 
     def stops() -> bool:
         before = next(asked)  # called twice before the first iteration ends
-        return should_stop is not None and should_stop() and before > 1
+        return should_stop() and before > 1
 
     reduction = EXACT if problem.loss == "l2" else ROUGH
     operator = _uniform(problem, reduction)
-    tick()
+    should_stop()
     right_hand_side = _right_hand_side(problem, translations, operator)
-    tick()
+    should_stop()
     precondition = build_preconditioner(operator)
-    tick()
+    should_stop()
     solved = conjugate_gradient(
         operator.apply, right_hand_side, precondition=precondition, reduction=reduction, max_iterations=MAX_START_ITERATIONS,
         should_stop=stops,
     )  # fmt: skip
-    tick()
+    should_stop()
     return solved.x.astype(problem.points.dtype, copy=False)
 
 

@@ -14,12 +14,11 @@ observations are rejected, α = (n + 1) / (N + 2), the mean under a uniform prio
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from pliant.solver.limits import frame_chunks
-from pliant.solver.pulse import pulse
+from pliant.solver.pulse import ShouldStop, never, pulse
 from pliant.solver.records import Floats, Tracks
 from pliant.solver.solution import Solution
 from pliant.solver.tracks.noise import weighted_median
@@ -37,7 +36,7 @@ def with_inlier_probability(
     *,
     full_confidence: float,
     loss: str,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> Solution:
     """Return the solution with the inlier probability of every observation.
 
@@ -56,7 +55,6 @@ def with_inlier_probability(
     should_stop : callable, optional
         Called between units of work to report progress; its result is ignored.
     """
-    tick = should_stop if should_stop is not None else bool
     seen = tracks.visible > 0
     rejected = seen & (confidence == 0)
     left, low, high = np.empty_like(tracks.points), np.full(2, np.inf), np.full(2, -np.inf)
@@ -66,7 +64,7 @@ def with_inlier_probability(
         placed = (tracks.points[some] - camera.translations[:, None])[seen[some]]
         low = np.minimum(low, placed.min(axis=0, initial=np.inf))
         high = np.maximum(high, placed.max(axis=0, initial=-np.inf))
-        tick()
+        should_stop()
     probability = inlier_probability(
         left,
         relative(tracks.visible, full_confidence),

@@ -6,19 +6,19 @@ decrease their sum. The energy cannot increase, however few iterations are run.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from pliant.solver.energy.low_rank import rank_term
 from pliant.solver.energy.objective import loss_of, prior, residuals_of, weights_of
-from pliant.solver.energy.problem import Array, Problem
+from pliant.solver.energy.problem import Problem
 from pliant.solver.errors import NotFinite
 from pliant.solver.linear import block_tridiagonal
 from pliant.solver.linear.conjugate_gradient import conjugate_gradient
 from pliant.solver.linear.preconditioner import build_preconditioner
 from pliant.solver.operators.normal_equations import Operator
-from pliant.solver.records import Floats
+from pliant.solver.pulse import ShouldStop, never
+from pliant.solver.records import Array, Floats
 from pliant.solver.shapes.state import State
 from pliant.solver.solution import Outcome
 from pliant.solver.threads import SMALLEST, over_ranges
@@ -45,7 +45,7 @@ def step(
     state: State,
     *,
     tolerance: float = 0.0,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> State:
     """Do one reweighting: shapes for the weights of `state`, then translations, then new weights.
 
@@ -58,19 +58,18 @@ def step(
     """
     operator = operator_at(problem, state)
     downhill = _downhill(problem, state, operator)
-    tick = should_stop if should_stop is not None else bool
-    tick()
+    should_stop()
     inner = operator.rounded(inner_precision(operator, state.reduction))
     precondition = build_preconditioner(inner)
     downhill = downhill.astype(inner.weights.dtype, copy=False)
-    tick()
+    should_stop()
     solved = conjugate_gradient(
         inner.apply, downhill, precondition=precondition, reduction=state.reduction, max_iterations=MAX_INNER,
         negligible=NEGLIGIBLE * tolerance * abs(state.objective), should_stop=should_stop,
     )  # fmt: skip
     del downhill, precondition, inner  # before the next weights are allocated
     shapes = np.add(state.shapes, solved.x, out=solved.x if solved.x.dtype == state.shapes.dtype else None)
-    tick()
+    should_stop()
     after = _evaluated(problem, shapes, state.translations, state.omega, reweighting=state.reweighting + 1)
     gained = state.objective - after.objective
     unforeseen = abs(gained - solved.decrease) / gained if gained > 0 else INNER_REDUCTION
@@ -165,14 +164,13 @@ def _evaluated(
             np.einsum("cp,cp->p", left, left, out=squared[frame])
 
     over_ranges(work, frames, smallest=max(1, SMALLEST // shapes[0].size))
-    weights = problem.weights
     value = float(losses.sum())
     value = value + prior(problem, shapes) if np.isfinite(value) else value
     if not np.isfinite(value):
         raise NotFinite(f"the energy became {value} after {reweighting} reweightings")
     seen = problem.confidence > 0
     return State(
-        shapes=shapes, translations=translations, omega=fresh, rank=rank_term(shapes, weights.low_rank, weights.rank_floor),
+        shapes=shapes, translations=translations, omega=fresh, rank=rank_term(shapes, problem.weights.low_rank),
         objective=value, residual=float(np.sqrt(np.median(squared if seen.all() else squared[seen]))),
         reweighting=reweighting, iterations=0, reduction=INNER_REDUCTION,
     )  # fmt: skip

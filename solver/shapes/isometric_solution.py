@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.evaluation.trust import assess_isometric
 from pliant.solver.isometry.surface import IsometricSurface, IsometricVerdict
-from pliant.solver.records import Camera, Choices, Floats, Tracks
+from pliant.solver.model.so3 import nearest
+from pliant.solver.records import Camera, Choices, Floats, Tracks, mean_scale
 from pliant.solver.settings import Settings
 from pliant.solver.solution import Outcome, Solution, Trace
 
@@ -74,7 +74,7 @@ def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera]:
     centred = surface.points - origin[:, None]
     rotations = _rotations(centred[:, surface.placed])
     scales = surface.focal / origin[:, 2]
-    unit = float(np.exp(np.log(scales).mean()))
+    unit = mean_scale(scales)
     shapes = unit * (centred @ rotations)
     point = np.array(surface.principal_point)
     translations = point + scales[:, None] * origin[:, :2]
@@ -110,7 +110,7 @@ def _rotations(centred: Floats) -> Floats:
     mean = centred[int(np.square(centred - centred.mean(axis=0)).sum(axis=(1, 2)).argmin())]
     rotations = np.tile(np.eye(3), (len(centred), 1, 1))
     for _ in range(ALTERNATIONS):
-        rotations = procrustes(centred.transpose(0, 2, 1) @ mean, proper=True)
+        rotations = nearest(centred.transpose(0, 2, 1) @ mean)
         mean = (centred @ rotations).mean(axis=0)
     return np.asarray(rotations @ rotations[0].T)
 

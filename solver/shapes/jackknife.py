@@ -17,25 +17,24 @@ Bayes confidence intervals based on bootstrap samples").
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import depth_map
-from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.model.early_stopping import Schedule, schedule
-from pliant.solver.model.expectation_maximisation import improve
+from pliant.solver.model.expectation_maximisation import ModelOrder, improve
 from pliant.solver.model.marginal_likelihood import fit
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.observation_model import ImageDensity
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.records import Floats
+from pliant.solver.model.so3 import nearest
+from pliant.solver.pulse import ShouldStop, never
+from pliant.solver.records import MIN_POINTS, Floats
 from pliant.solver.refinement.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.shapes.uncertainty import distant_paths
 from pliant.solver.tracks.frame_selection import between, evenly_spread
-from pliant.solver.tracks.matrix import centred, columns, points_of
+from pliant.solver.tracks.matrix import centred, columns, gram_of, points_of
 from scipy.spatial import cKDTree
 
 PARTS = 6
@@ -47,9 +46,6 @@ MAX_JACKKNIFE_FRAMES = 100
 LEARNING_ROUNDS, TURNING_ITERATIONS = 20, 60
 """Iterations of expectation maximisation and of L-BFGS in each refinement. Ending before the minimum understates the change: with 5 and 15,
 the estimated error of the dance sequence is .128, with 40 and 120 it is .169."""
-
-MIN_LEARNED_POINTS = 4
-"""Minimum number of points to learn from."""
 
 CLUSTERING = 5
 """Iterations of k-means for the parts."""
@@ -96,7 +92,7 @@ def learning_changes(
     *,
     turning: bool,
     seed: int = 0,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> Changes:
     """Return how far positions change with the points from which cameras and prior are learned.
 
@@ -118,31 +114,31 @@ def learning_changes(
     frames, nothing = len(estimate.rotations), Changes(None, np.zeros((0, 3)))
     used = evenly_spread(frames, MAX_JACKKNIFE_FRAMES)
     start = Learned(
-        np.asarray(estimate.rotations)[used],
-        np.asarray(estimate.scales)[used],
+        estimate.rotations[used],
+        estimate.scales[used],
         replace(covariance, modes=covariance.modes[used]),
         np.inf,
     )
-    sample = _Sample(centred(np.asarray(estimate.sample)[used]), observed[used])
-    if sample.points.shape[1] <= MIN_LEARNED_POINTS:
+    sample = _Sample(centred(estimate.sample[used]), observed[used])
+    if sample.points.shape[1] <= MIN_POINTS:
         return nothing
     every, without = np.ones(sample.points.shape[1], dtype=bool), []
     try:
         points = points_of(sample.expected(start, every)[0])
         order = ModelOrder(ordered=covariance.ordered)
-        early = schedule(points, _projections(start), order, seed=seed, should_stop=should_stop)
+        early = schedule(points, start.projections, order, seed=seed, should_stop=should_stop)
         part_of, everything = parts(points), _shapes_from(sample, every, start, early, turning)
         for part in np.unique(part_of):
-            if should_stop is not None and should_stop():
+            if should_stop():
                 return nothing
-            if (part_of != part).sum() >= MIN_LEARNED_POINTS:
+            if (part_of != part).sum() >= MIN_POINTS:
                 without.append(_onto(_shapes_from(sample, part_of != part, start, early, turning), everything))
     except np.linalg.LinAlgError:  # depth is unbounded
         return replace(nothing, bounded=False)
     if len(without) < 2:
         return nothing
     squared = between(used, _mean_squared_change(np.stack(without), everything), frames)
-    squared /= np.square(np.asarray(estimate.scales))[:, None]
+    squared /= np.square(estimate.scales)[:, None]
     world = np.einsum("fij,fpi->pj", start.rotations / start.scales[:, None, None], everything) / len(used)
     return Changes(np.sqrt(squared), world)
 
@@ -162,8 +158,8 @@ class _Sample:
         points, observed = self.points[:, kept], self.observed[:, kept]
         if observed.all():
             rows = columns(points)
-            return rows, rows @ rows.T / rows.shape[1]
-        image = found.covariance.of_image(_projections(found))
+            return rows, gram_of(rows)
+        image = found.covariance.of_image(found.projections)
         density = ImageDensity.of(image, found.covariance.noise_variance)
         means, covariance = density.moments(np.where(observed[..., None], points, 0.0), observed.astype(np.float64))
         return means, (means @ means.T + covariance) / means.shape[1]
@@ -198,7 +194,7 @@ def _shapes_from(
     gram = sample.expected(start, kept)[1]
 
     def relearned(found: Learned) -> Learned:
-        projections = _projections(found)
+        projections = found.projections
         if early is None:
             return replace(found, covariance=improve(found.covariance, gram, projections, iterations=LEARNING_ROUNDS))
         return replace(found, covariance=early.learned(gram, projections))
@@ -216,12 +212,8 @@ def _shapes_from(
     return np.concatenate([points_of(means), depths[..., None]], axis=2)
 
 
-def _projections(found: Learned) -> Floats:
-    return np.asarray(found.rotations[:, :2] * found.scales[:, None, None])
-
-
 def _onto(shapes: Floats, others: Floats) -> Floats:
     """Return the shapes with each frame centred and rotated onto the same frame of `others`."""
     moved, fixed = centred(shapes), centred(others)
-    turns = procrustes(fixed.transpose(0, 2, 1) @ moved, proper=True)
+    turns = nearest(fixed.transpose(0, 2, 1) @ moved)
     return np.asarray(moved @ turns.transpose(0, 2, 1))

@@ -7,13 +7,12 @@ observations of its point, the cameras and the learned covariance (`model.observ
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.limits import LEARNED_FRAMES
 from pliant.solver.model.observation_model import inlier_probabilities
 from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import POINTS_PER_CHUNK, Filling
 from pliant.solver.tracks.normalization import Normalized
@@ -27,7 +26,7 @@ def gross_outliers(
     filling: Filling,
     *,
     share: float,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> NDArray[np.bool_]:
     """Return the observations that are more probably outliers than not, shape `(F, P)`.
 
@@ -58,7 +57,7 @@ def gross_outliers(
         weight = np.where(filling.outliers(flat.points[:, span], confidence), 0.0, confidence)
         points = np.where(confidence[..., None] > 0, flat.points[:, span] - translations[:, None], 0.0)
         for window, image in zip(windows, images, strict=True):
-            if should_stop is not None and should_stop():
+            if should_stop():
                 return found
             probability, _ = inlier_probabilities(
                 image, covariance.noise_variance, points[window], confidence[window], weight[window], share=share

@@ -43,7 +43,7 @@ def corrected_again(
     view = estimate.perspective
     assert view is not None
     places = np.arange(normalized.points.shape[1]) if kept is None else kept
-    rows = np.asarray(estimate.scales)[:, None] * np.asarray(estimate.rotations)[:, 2] @ problem.axes
+    rows = estimate.scales[:, None] * estimate.rotations[:, 2] @ problem.axes
     depths = np.einsum("fi,fip->fp", rows, state.shapes.astype(np.float64))
     part = replace(normalized, points=normalized.points[:, places], visible=normalized.visible[:, places])
     points = corrected_tracks(part, view, depths).points

@@ -37,7 +37,7 @@ def build_problem(
     if covariance is not None:
         axes, precisions = covariance.precisions()
         bands, quadratic = np.zeros_like(bands), precisions.scaled(weights.temporal)
-    projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2] @ axes
+    projections = estimate.projections @ axes
     problem = Problem(
         points=np.ascontiguousarray(normalized.points.transpose(0, 2, 1), dtype=kind),
         confidence=normalized.visible.astype(kind),

@@ -26,7 +26,7 @@ from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import loss_weights
 from pliant.solver.mesh import Mesh
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.operators.mesh_laplacian import Matrix
+from pliant.solver.operators.aggregation import Matrix
 from pliant.solver.records import MIN_POINTS, Floats
 from pliant.solver.shapes.irls import init
 from pliant.solver.shapes.state import State

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pliant.solver.energy.problem import Array
 from pliant.solver.operators.normal_equations import RankTerm
-from pliant.solver.records import Floats
+from pliant.solver.records import Array, Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)

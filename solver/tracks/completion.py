@@ -9,15 +9,17 @@ P; all points are then projected onto the basis in one pass.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.agreement import check_seen
+from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
 from pliant.solver.threads import SMALLEST, over_ranges
+from pliant.solver.tracks.frame_selection import longest_gaps
 from pliant.solver.tracks.matrix import centred, columns
 from pliant.solver.tracks.noise import RAYLEIGH_MEDIAN, weighted_median
 from pliant.solver.tracks.normalization import Normalized
@@ -79,7 +81,24 @@ class Filling:
 
     def outliers(self, points: Floats, weight: Floats) -> NDArray[np.bool_]:
         """Return a mask of the gross outliers, shape `(F, P)`, in `points (F, P, 2)` of confidence `weight (F, P)`."""
-        return _filled(points, weight, self.basis, self.spread, self.scale)[1]
+        return self._predicted(points, weight)[1]
+
+    def filled(self, points: Floats, weight: Floats) -> tuple[Floats, float]:
+        """Replace hidden entries and outliers by predictions; also return the replaced share of the visible entries' confidence.
+
+        An entry with confidence 0 < c < 1 becomes c times itself plus 1 − c times its prediction: the EM completion of an
+        observation whose noise variance is 1/c times as large.
+        """
+        predicted, wrong = self._predicted(points, weight)
+        trust = np.where(wrong, 0.0, weight)[..., None]
+        filled = np.where(trust == 1, points, predicted + trust * (points - predicted))
+        return filled, float(weight[wrong].sum() / max(weight.sum(), np.finfo(float).tiny))
+
+    def _predicted(self, points: Floats, weight: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the predictions, shape `(F, P, 2)`, and a mask of the visible gross outliers, shape `(F, P)`."""
+        coefficients, _ = coefficients_of(points, weight, self.basis, self.spread, self.scale, sweeps=4)
+        predicted = predict(self.basis, coefficients)
+        return predicted, gross(points, weight, predicted, self.scale)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,9 +127,7 @@ class Completed:
     """Indices of the sampled points, shape `(S,)`."""
 
 
-def complete(
-    normalized: Normalized, *, seed: int = 0, rank: int = 0, should_stop: Callable[[], bool] | None = None
-) -> Completed:
+def complete(normalized: Normalized, *, seed: int = 0, rank: int = 0, should_stop: ShouldStop = never) -> Completed:
     """Fill hidden entries, replace gross outliers, and return the Gram matrix of the result.
 
     Parameters
@@ -134,9 +151,10 @@ def complete(
     check_seen(normalized.visible)
     points, weight = normalized.points[:, chosen], normalized.visible[:, chosen]
     basis, spread, scale = fit_basis(points, weight, random, rank, should_stop=should_stop)
-    outliers = fill(points, weight, basis, spread, scale)[1]
+    found = Filling(basis, spread, scale)
+    _, outliers = found.filled(points, weight)
     clean = outliers == 0.0 and bool((normalized.visible == 1).all())
-    filling = None if clean else Filling(basis, spread, scale)
+    filling = None if clean else found
     gram, translations, sample = _carry(normalized, filling, chosen, should_stop)
     return Completed(gram, sample, translations, 0 if clean else basis.shape[2], outliers, filling, chosen)
 
@@ -181,11 +199,7 @@ def briefly_hidden(visible: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
     A point is used if it is hidden for at most `LONGEST_GAP` of the frames at a time, or for no longer than the median point that some
     frame shows.
     """
-    seen = visible > 0
-    gaps, gap = np.zeros(seen.shape[1], dtype=np.intp), np.zeros(seen.shape[1], dtype=np.intp)
-    for shown in seen:
-        gap = np.where(shown, 0, gap + 1)
-        np.maximum(gaps, gap, out=gaps)
+    seen, gaps = visible > 0, longest_gaps(visible)
     used = np.zeros(len(gaps), dtype=bool)
     for shown in seen:
         if shown.any():
@@ -205,7 +219,7 @@ def ranks(points: Floats) -> NDArray[np.intp]:
 
 def fit_basis(
     points: Floats, weight: Floats, random: np.random.Generator, given: int = 0, *,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: ShouldStop = never,
 ) -> tuple[Floats, Floats, float]:  # fmt: skip
     """Return the basis (F, 2, r) with the translation last, the covariance of its coefficients, and the residual scale.
 
@@ -229,7 +243,7 @@ def fit_basis(
             best_error, best_rank, best = error, rank, basis
         elif rank > 2 * best_rank:
             break
-        if rank == given or (should_stop is not None and should_stop()):
+        if rank == given or should_stop():
             break
     if not np.isfinite(best_error):
         best = _widen(np.zeros((frames, 2, 0)), points, weight, start, min(3, min(2 * frames, count) - 1))
@@ -242,8 +256,8 @@ def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> 
 
     The weights are those of the Cauchy loss with a scale of three times the residual scale.
     """
-    coefficients, spread = coefficients_of(points, weight, basis, None, 1.0, sweeps=3)
-    scale = MIN_RESIDUAL_SCALE
+    coefficients, _ = coefficients_of(points, weight, basis, None, 1.0, sweeps=3)
+    spread, scale = coefficients.T @ coefficients / len(coefficients), MIN_RESIDUAL_SCALE
     for _ in range(sweeps):
         lengths = _lengths(points - predict(basis, coefficients))
         scale = max(_typical(lengths, weight), MIN_RESIDUAL_SCALE)
@@ -254,7 +268,9 @@ def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> 
         right = extended.T @ (robust[..., None] * points)
         basis = np.linalg.solve(normal, right).transpose(0, 2, 1)
         basis, change = _orthonormal(basis)
-        coefficients, spread = coefficients_of(points, robust, basis, change @ spread @ change.T, scale, sweeps=1)
+        coefficients, normal = coefficients_of(points, robust, basis, change @ spread @ change.T, scale, sweeps=1)
+        # One EM step: the second moment over the points, posterior variance included.
+        spread = coefficients.T @ coefficients / len(coefficients) + scale**2 * np.linalg.inv(normal).mean(axis=0)
     return basis, coefficients, spread, scale
 
 
@@ -266,14 +282,12 @@ def coefficients_of(
     scale: float,
     *,
     sweeps: int,
-    with_moment: bool = True,
 ) -> tuple[Floats, Floats]:
-    """Return each point's coefficients on the basis, shape (S, r−1), and their covariance, shape (r−1, r−1).
+    """Return each point's coefficients on the basis, shape (S, r−1), and the matrices of their equations, shape (S, r−1, r−1).
 
-    Reweighted least squares with a Gaussian prior. A point visible in few frames determines few of its coefficients;
-    without a prior the others, and thus the hidden positions, would be unbounded. The covariance is the second moment
-    over the points, posterior variance included (one EM step); the first estimate comes from damped least squares. If
-    `with_moment` is False, an identity matrix is returned instead.
+    Reweighted least squares with a Gaussian prior of covariance `spread`; damped least squares if it is None. A point visible
+    in few frames determines few of its coefficients; without a prior the others, and thus the hidden positions, would be
+    unbounded.
     """
     columns, shift = basis[:, :, :-1], basis[:, :, -1]
     products = np.einsum("fci,fcj->fij", columns, columns).reshape(len(basis), -1)
@@ -288,10 +302,7 @@ def coefficients_of(
             lengths = _lengths(points - predict(basis, coefficients))
             typical = max(_typical(lengths, weight), MIN_RESIDUAL_SCALE)
             robust = weight / (1 + (lengths / (3 * typical)) ** 2)
-    if not with_moment:
-        return coefficients, np.eye(size)
-    moment = coefficients.T @ coefficients / len(coefficients)
-    return coefficients, moment if spread is None else moment + scale**2 * np.linalg.inv(normal).mean(axis=0)
+    return coefficients, normal
 
 
 def _solved(normal: Floats, right: Floats) -> Floats:
@@ -312,27 +323,6 @@ def predict(basis: Floats, coefficients: Floats) -> Floats:
     return np.asarray((along + basis[:, :, -1:]).transpose(0, 2, 1))
 
 
-def fill(points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: float) -> tuple[Floats, float]:
-    """Replace hidden entries and outliers by predictions; also return the replaced share of the visible entries' confidence.
-
-    An entry with confidence 0 < c < 1 becomes c times itself plus 1 − c times its prediction: the EM completion of an
-    observation whose noise variance is 1/c times as large.
-    """
-    predicted, wrong = _filled(points, weight, basis, spread, scale)
-    trust = np.where(wrong, 0.0, weight)[..., None]
-    filled = np.where(trust == 1, points, predicted + trust * (points - predicted))
-    return filled, float(weight[wrong].sum() / max(weight.sum(), np.finfo(float).tiny))
-
-
-def _filled(
-    points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: float
-) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the predictions, shape `(F, P, 2)`, and a mask of the visible gross outliers, shape `(F, P)`."""
-    coefficients, _ = coefficients_of(points, weight, basis, spread, scale, sweeps=4, with_moment=False)
-    predicted = predict(basis, coefficients)
-    return predicted, gross(points, weight, predicted, scale)
-
-
 def gross(points: Floats, weight: Floats, predicted: Floats, scale: float) -> NDArray[np.bool_]:
     """Return a mask of the visible entries that are gross outliers given their prediction, shape `(F, S)`."""
     return np.asarray(
@@ -349,21 +339,21 @@ def spans(normalized: Normalized, filling: Filling | None) -> Iterator[tuple[NDA
         shown = (weight > 0).any(axis=0)
         points, weight = points[:, shown], weight[:, shown]
         if filling is not None:
-            points, _ = fill(points, weight, filling.basis, filling.spread, filling.scale)
+            points, _ = filling.filled(points, weight)
         yield np.flatnonzero(shown) + span.start, points
 
 
 def _carry(
-    normalized: Normalized, filling: Filling | None, chosen: NDArray[np.intp], tick: Callable[[], bool] | None
+    normalized: Normalized, filling: Filling | None, chosen: NDArray[np.intp], should_stop: ShouldStop
 ) -> tuple[Floats, Floats, Floats]:
-    """Return Gram matrix, translations and centred sample, completed chunk by chunk; call `tick`, but ignore its result."""
+    """Return Gram matrix, translations and centred sample, completed chunk by chunk; call `should_stop`, but ignore its result."""
     frames = len(normalized.points)
     gram, total = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2))
     sample = np.zeros((frames, len(chosen), 2))
     used, often = 0, often_visible(normalized.visible)
     for number, (places, points) in enumerate(spans(normalized, filling), start=1):
-        if number % CHUNKS_PER_TICK == 0 and tick is not None:
-            tick()
+        if number % CHUNKS_PER_TICK == 0:
+            should_stop()
         inside = np.isin(places, chosen, assume_unique=True)
         sample[:, np.isin(chosen, places, assume_unique=True)] = points[:, inside]
         points = points[:, often[places]]
@@ -394,7 +384,7 @@ def _widen(basis: Floats, points: Floats, weight: Floats, start: Floats, rank: i
         left, shift = start, start.mean(axis=1)
         old = np.zeros((frames, 2, 0))
     else:
-        coefficients, _ = coefficients_of(points, weight, basis, None, 1.0, sweeps=2, with_moment=False)
+        coefficients, _ = coefficients_of(points, weight, basis, None, 1.0, sweeps=2)
         left = points - predict(basis, coefficients)
         scale = max(_typical(_lengths(left), weight), MIN_RESIDUAL_SCALE)
         left *= (weight / (1 + (_lengths(left) / (3 * scale)) ** 2))[..., None]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.records import Floats
@@ -10,8 +12,17 @@ from pliant.solver.records import Floats
 def informative_frames(visible: Floats) -> NDArray[np.bool_]:
     """Return a mask of the frames with at least 3 points and a tenth of the median number, shape `(F,)`; all if fewer than 3 qualify."""
     seen = (visible > 0).sum(axis=1)
-    is_identifiable = np.asarray(seen >= max(3.0, 0.1 * float(np.median(seen[seen > 0]))))
-    return is_identifiable if is_identifiable.sum() >= 3 else np.ones(len(seen), dtype=bool)
+    informative = np.asarray(seen >= max(3.0, 0.1 * float(np.median(seen[seen > 0]))))
+    return informative if informative.sum() >= 3 else np.ones(len(seen), dtype=bool)
+
+
+def longest_gaps(visible: NDArray[np.floating[Any]]) -> NDArray[np.intp]:
+    """Return the length of the longest run of frames in which each point of `visible (F, P)` is hidden, shape `(P,)`."""
+    longest, gap = np.zeros(visible.shape[1], dtype=np.intp), np.zeros(visible.shape[1], dtype=np.intp)
+    for shown in visible > 0:
+        gap = np.where(shown, 0, gap + 1)
+        np.maximum(longest, gap, out=longest)
+    return longest
 
 
 def evenly_spread(total: int, count: int) -> NDArray[np.intp]:
@@ -31,5 +42,14 @@ def of_frames(gram: Floats, used: NDArray[np.intp]) -> Floats:
 
 
 def between(used: NDArray[np.intp], values: Floats, frames: int) -> Floats:
-    """Return values of all frames, linearly interpolated between the `values (F', n)` of the frames `used`, shape `(F, n)`."""
-    return np.stack([np.interp(np.arange(frames), used, each) for each in values.T], axis=1)
+    """Return values of all frames, linearly interpolated between those of the frames `used`.
+
+    Shapes `(F', n)` to `(F, n)`, or `(F',)` to `(F,)`.
+    """
+    every = np.arange(frames)
+    if values.ndim == 1:
+        return np.interp(every, used, values)
+    found = np.zeros((frames, values.shape[1]))
+    for column, each in zip(found.T, values.T, strict=True):
+        column[:] = np.interp(every, used, each)
+    return found

@@ -16,6 +16,11 @@ def columns(points: Floats) -> Floats:
     return np.asarray(points.transpose(0, 2, 1).reshape(2 * len(points), -1))
 
 
+def gram_of(matrix: Floats) -> Floats:
+    """Return W Wᵀ / P of a matrix `(2F, P)`, shape `(2F, 2F)`."""
+    return np.asarray(matrix @ matrix.T / matrix.shape[1])
+
+
 def points_of(matrix: Floats) -> Floats:
     """Return the points `(F, P, 2)` of a matrix `(2F, P)`, the inverse of `columns`."""
     return matrix.reshape(-1, 2, matrix.shape[1]).transpose(0, 2, 1)

@@ -163,7 +163,10 @@ def test_every_round_of_em_pulses(most_dense: int, monkeypatch: pytest.MonkeyPat
     pulses = []
     with pulses_to(lambda: pulses.append(1)):
         expectation_maximisation.improve(
-            expectation_maximisation.begin(gram, projections), gram, projections, iterations=7
+            expectation_maximisation.scratch(gram, projections, expectation_maximisation.ModelOrder()),
+            gram,
+            projections,
+            iterations=7,
         )
     assert len(pulses) >= 7
 

@@ -216,11 +216,13 @@ def test_every_random_generator_uses_the_seed_of_the_settings(monkeypatch: pytes
 def test_mismatched_inputs_are_rejected(cameras: Cameras, prior: Prior, solution: Solution) -> None:
     tracks = MADE.tracks
     fewer = Tracks.from_arrays(tracks.points[:6])
+    in_perspective = estimate_cameras(tracks, KNOWN, settings=Settings(order="film", focal=900.0))
     short = estimate_cameras(fewer, KnownCamera.from_arrays(MADE.rotations[:6], MADE.scales[:6]))
     for field, call in (
         ("cameras", lambda: learn_prior(SPOILED, cameras)),
         ("cameras", lambda: solve_shapes(fewer, cameras, prior)),
         ("prior", lambda: solve_shapes(tracks, cameras, learn_prior(fewer, short))),
+        ("prior", lambda: solve_shapes(tracks, in_perspective, learn_prior(fewer, short))),
         ("start", lambda: solve_shapes(tracks, cameras, prior, start=solution.shapes[:, :5])),
         ("start", lambda: solve_shapes(tracks, cameras, prior, start=solution.shapes * np.nan)),
         ("rotations", lambda: estimate_cameras(fewer, KNOWN)),

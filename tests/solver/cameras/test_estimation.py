@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from camera_errors import degrees_apart
@@ -24,6 +26,7 @@ from pliant.solver.model.so3 import (
     logarithm,
     start_at_identity,
 )
+from pliant.solver.reconstruction import cameras as stage
 from pliant.solver.tracks.completion import RANKS, complete, often_visible, spans
 from pliant.solver.tracks.matrix import columns
 from pliant.solver.tracks.normalization import normalize
@@ -93,17 +96,33 @@ def test_outliers_and_hidden_points_barely_change_the_cameras() -> None:
 @pytest.mark.slow
 def test_a_still_camera_is_reported() -> None:
     still = np.broadcast_to(np.eye(3), (8, 3, 3))
-    found = estimate_cameras(normalize(Tracks.from_arrays(view(RIGID, still))), Settings())
+    found = stage.estimate_cameras(Tracks.from_arrays(view(RIGID, still)), settings=Settings(prior="smooth"))
     assert any("hardly turns" in sentence for sentence in found.warnings)
+
+
+@pytest.mark.parametrize(("degrees", "warned"), [(0.0, True), (12.0, False)])
+def test_the_warning_is_about_the_final_cameras(monkeypatch: pytest.MonkeyPatch, degrees: float, warned: bool) -> None:
+    """The refinement with the shapes may turn cameras by more than the first estimate does."""
+    final = exponential(np.radians(np.linspace(-degrees / 2, degrees / 2, 8))[:, None] * [1.0, 0.0, 0.0])
+    monkeypatch.setattr(stage, "_with_shapes", lambda estimate, *_: (replace(estimate, rotations=final), None))
+    settings = Settings(prior="smooth", refine_rotations=False)
+    found = stage.estimate_cameras(Tracks.from_arrays(view(RIGID, CAMERA[:8])), settings=settings)
+    assert any("hardly turns" in sentence for sentence in found.warnings) == warned
+
+
+def test_any_two_views_are_compared() -> None:
+    swung = exponential(np.radians([0.0, 6.0, -6.0])[:, None] * [1.0, 0.0, 0.0])
+    assert stage.turn_warnings(swung) == ()
+    assert stage.turn_warnings(swung[:2])
 
 
 def test_a_roll_about_the_viewing_direction_is_no_turn() -> None:
     angles = np.radians(np.linspace(0, 60, 8))
     rolled, zero, one = np.cos(angles), np.zeros(8), np.ones(8)
     rows = [[rolled, -np.sin(angles), zero], [np.sin(angles), rolled, zero], [zero, zero, one]]
-    assert estimation._warnings(np.array(rows).transpose(2, 0, 1))
+    assert stage.turn_warnings(np.array(rows).transpose(2, 0, 1))
     turned = np.array([[one, zero, zero], [zero, rolled, -np.sin(angles)], [zero, np.sin(angles), rolled]])
-    assert estimation._warnings(turned.transpose(2, 0, 1)) == ()
+    assert stage.turn_warnings(turned.transpose(2, 0, 1)) == ()
 
 
 @pytest.mark.parametrize(("frames", "points"), [(3, 4), (3, 60), pytest.param(20, 4, marks=pytest.mark.long)])

@@ -24,6 +24,7 @@ from pliant.solver.evaluation.metrics import (
     reprojection,
     rotation_degrees,
 )
+from pliant.solver.model.so3 import nearest
 from scipy.spatial.transform import Rotation
 
 ALL = (e3d_sequence, e3d_frame, e3d_frame_similarity, e3d_mocap)
@@ -114,12 +115,12 @@ def test_more_alignment_freedom_gives_a_lower_error():
 
 def test_procrustes_beats_nearby_rotations():
     products = random.standard_normal((3, 3))
-    for proper in (False, True):
-        best = procrustes(products, proper=proper)
+    for nearby in (procrustes, nearest):
+        best = nearby(products)
         assert best @ best.T == pytest.approx(np.eye(3))
         for nudge in Rotation.from_rotvec(0.05 * random.standard_normal((20, 3))).as_matrix():
             assert np.sum(best * products) > np.sum((nudge @ best) * products)
-    assert np.linalg.det(procrustes(-np.eye(3), proper=True)) == pytest.approx(1)
+    assert np.linalg.det(nearest(-np.eye(3))) == pytest.approx(1)
     assert procrustes(-np.eye(3)) == pytest.approx(-np.eye(3))
 
 

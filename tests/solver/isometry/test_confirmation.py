@@ -15,13 +15,14 @@ from pliant.solver.isometry.focal_sweep import FocalSearch, Judgement, Tried, tr
 from pliant.solver.isometry.refinement import refine
 from pliant.solver.isometry.surface import isometric_surface
 from pliant.solver.monitor import Monitor
+from pliant.solver.pulse import never
 from pliant.solver.reconstruction.surface import with_verdict
 from pliant.solver.stages import Stage
 from rolled_sheets import CENTRE, FOCAL, SIZE, one_scale_error, rolled
 
 
 def search_of(tracks: Tracks) -> FocalSearch:
-    found = surface._prepared(tracks.points, tracks.visible > 0, np.array(CENTRE), None)
+    found = surface._prepared(tracks.points, tracks.visible > 0, np.array(CENTRE), never)
     assert found is not None
     return found
 

@@ -26,6 +26,7 @@ from pliant.solver.isometry.refinement import (
 )
 from pliant.solver.isometry.surface import isometric_surface
 from pliant.solver.model.so3 import exponential
+from pliant.solver.pulse import never
 from rolled_sheets import CENTRE, FOCAL, SIZE, one_scale_error, rolled
 
 SMALL = {"frames": 6, "side": 7}
@@ -91,7 +92,7 @@ def with_inconsistencies(monkeypatch: pytest.MonkeyPatch, of_focal: Callable[[fl
 
 SEARCH = FocalSearch(
     Anchors(np.ones((2, 3, 2)), np.ones((2, 3), bool), 0.0),
-    edges=np.zeros((1, 2), np.intp), seen=np.ones((2, 3), bool), frames=np.arange(2), centre=np.zeros(2), should_stop=None,
+    edges=np.zeros((1, 2), np.intp), seen=np.ones((2, 3), bool), frames=np.arange(2), centre=np.zeros(2), should_stop=never,
 )  # fmt: skip
 
 

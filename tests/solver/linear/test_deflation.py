@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from learning import dense_precisions
 from pliant.solver import gallery
 from pliant.solver.linear import points
-from pliant.solver.linear.conjugate_gradient import conjugate_gradient
+from pliant.solver.linear.conjugate_gradient import Linear, conjugate_gradient
 from pliant.solver.linear.deflation import build_coarse
-from pliant.solver.linear.preconditioner import _alike, build_preconditioner
+from pliant.solver.linear.preconditioner import _by_inverse, build_preconditioner, temporal_matrix
 from pliant.solver.operators.gauss_markov import PathPrior
 from pliant.solver.operators.normal_equations import Operator
+from scipy import linalg
 
 
 def operator(*, hidden: float) -> Operator:
@@ -23,6 +25,19 @@ def operator(*, hidden: float) -> Operator:
     weights = np.where(random.random((frames, 1, points)) < hidden, 0.0, 500.0) * np.ones((1, 2, 1))
     projections = np.asarray(made.rotations)[:, :2]
     return Operator(projections, weights, np.zeros((2, frames)), None, 0.0, None, prior)
+
+
+def alike(given: Operator) -> Linear:
+    """Return the inverse with one mean weight per frame."""
+    assert given.quadratic is not None
+    whole = temporal_matrix(given)
+    whole += (
+        linalg.block_diag(*dense_precisions(given.quadratic))
+        .reshape(3, 18, 3, 18)
+        .transpose(1, 0, 3, 2)
+        .reshape(54, 54)
+    )
+    return _by_inverse(whole, given.weights.dtype)
 
 
 def test_points_with_equal_weights_need_no_correction() -> None:
@@ -60,4 +75,4 @@ def test_the_correction_halves_the_iterations_with_hidden_points() -> None:
             given.apply, b.copy(), precondition=precondition, reduction=1e-4, max_iterations=2000  # type: ignore[arg-type]
         ).iterations  # fmt: skip
 
-    assert 1 < iterations(build_preconditioner(given)) < 0.5 * iterations(_alike(given))
+    assert 1 < iterations(build_preconditioner(given)) < 0.5 * iterations(alike(given))

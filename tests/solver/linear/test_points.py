@@ -23,7 +23,7 @@ def operator() -> Operator:
     made = gallery.face(FRAMES, POINTS, mesh="triangles")
     time = np.linspace(0, 1, FRAMES)
     modes = np.stack([np.ones(FRAMES), np.sin(5 * time), np.cos(7 * time)], axis=1)
-    bands, norm = walk_bands(FRAMES)
+    bands, norm = walk_bands(FRAMES, ordered=True)
     prior = PathPrior.of(bands * norm / 1e-5, (0.3 * modes,) * 3).scaled(3e-5)
     weights = np.full((FRAMES, 2, made.tracks.num_points), 500.0)
     projections = np.asarray(made.rotations)[:, :2]

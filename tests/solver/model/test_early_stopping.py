@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pliant.solver.model import early_stopping
 from pliant.solver.model.early_stopping import learn_with_early_stopping
-from pliant.solver.model.expectation_maximisation import learned
-from pliant.solver.model.model_order import MIN_JUDGED_POINTS, ModelOrder, held_out_nll
+from pliant.solver.model.expectation_maximisation import ModelOrder, learned
+from pliant.solver.model.model_order import MIN_JUDGED_POINTS, held_out_nll
 from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
@@ -24,7 +24,7 @@ def drawn(points: int, *, modes: int, drift: float, seed: int = 0) -> np.ndarray
     waves = np.stack([0.5 / (1 + k) * np.sin((k + 1) * np.pi * TIME + k) for k in range(modes)], axis=1)
     random = np.random.default_rng(seed)
     middle = random.standard_normal((points, 3)) * np.sqrt([0.2, 0.4, 0.6])
-    walk = np.linalg.cholesky(drift * random_walk(FRAMES))
+    walk = np.linalg.cholesky(drift * random_walk(FRAMES, ordered=True))
     deform = np.einsum("fk,pkc->fpc", waves, random.standard_normal((points, modes, 3)))
     deform += np.einsum("fg,pgc->fpc", walk, random.standard_normal((points, FRAMES, 3)))
     return np.einsum("fic,fpc->fpi", PAIRS, middle + deform) + 1e-4 * random.standard_normal((FRAMES, points, 2))
@@ -41,7 +41,7 @@ def gram_of(images: np.ndarray) -> np.ndarray:
 def both(images: np.ndarray) -> tuple[ShapeCovariance, ShapeCovariance, str]:
     """The covariance with early stopping, the fully learned one, and the reason."""
     found, why = learn_with_early_stopping(images, gram_of(images), PAIRS, ModelOrder())
-    return found, learned(gram_of(images), PAIRS), why
+    return found, learned(gram_of(images), PAIRS, ModelOrder()), why
 
 
 def test_early_stopping_avoids_overfitting_the_given_points() -> None:

@@ -51,7 +51,7 @@ def image_of(basis: Basis, projections: np.ndarray, axis_covariance: np.ndarray,
     for frame in range(FRAMES):
         seen[2 * frame : 2 * frame + 2, 3 * frame : 3 * frame + 3] = projections[frame]
     shapes = np.kron(basis.weights, np.eye(3)) @ basis.root
-    world = shapes @ shapes.T + np.exp(2 * basis.logs[1]) * np.kron(random_walk(FRAMES), axis_covariance)
+    world = shapes @ shapes.T + np.exp(2 * basis.logs[1]) * np.kron(random_walk(FRAMES, ordered=True), axis_covariance)
     return np.asarray(seen @ world @ seen.T + noise * np.eye(2 * FRAMES))
 
 

@@ -106,8 +106,8 @@ def test_the_walk_posterior_matches_its_dense_precision() -> None:
     images = np.zeros((2 * frames, 3 * frames))
     for index, block in enumerate(model.walk):
         images[2 * index : 2 * index + 2, 3 * index : 3 * index + 3] = block
-    precision = np.linalg.inv(np.kron(0.02 * random_walk(frames), np.eye(3))) + images.T @ images / 0.0025
-    walk = WalkPosterior.of(model.walk, noise_variance=0.0025, walk_variance=0.02)
+    precision = np.linalg.inv(np.kron(0.02 * random_walk(frames, ordered=True), np.eye(3))) + images.T @ images / 0.0025
+    walk = WalkPosterior.of(model.walk, noise_variance=0.0025, walk_variance=0.02, ordered=True)
     columns = np.random.default_rng(0).normal(size=(frames, 3, 4))
     expected = np.linalg.solve(precision, columns.reshape(3 * frames, 4)).reshape(columns.shape)
     np.testing.assert_allclose(walk.solve(columns), expected, atol=1e-12)

@@ -26,7 +26,7 @@ def test_the_covariances_reported_are_those_of_the_energy(floor: float) -> None:
     seen = np.zeros((2 * frames, 3 * frames))
     for frame in range(frames):
         seen[2 * frame : 2 * frame + 2, 3 * frame : 3 * frame + 3] = scales[frame] * turned[frame, :2]
-    over_frames = motion.modes @ motion.modes.T + walk_variance * random_walk(frames)
+    over_frames = motion.modes @ motion.modes.T + walk_variance * random_walk(frames, ordered=True)
     world = np.kron(np.ones((frames, frames)), mean_covariance) + np.kron(over_frames, axis_covariance)
     image = seen @ world @ seen.T + noise * np.eye(2 * frames)
     expected = (np.linalg.slogdet(image)[1] + np.trace(np.linalg.solve(image, gram))) / (2 * frames)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from learning import dense_precisions
 from pliant.solver import gallery, threads_limited
 from pliant.solver.linear import points
 from pliant.solver.linear.deflation import build_coarse
@@ -28,7 +29,7 @@ def roots() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def prior(drift: float = 1e-3) -> PathPrior:
-    bands, norm = walk_bands(FRAMES)
+    bands, norm = walk_bands(FRAMES, ordered=True)
     return PathPrior.of(bands * norm / drift, roots())
 
 
@@ -44,9 +45,9 @@ def a_frame_s(weight: float) -> np.ndarray:
 
 
 def test_the_path_prior_is_the_inverse_of_the_covariance() -> None:
-    bands, norm = walk_bands(FRAMES)
+    bands, norm = walk_bands(FRAMES, ordered=True)
     chain = np.diag(bands[0]) + np.diag(bands[1, :-1], 1) + np.diag(bands[1, :-1], -1)
-    for found, root in zip(prior().matrices(), roots(), strict=True):
+    for found, root in zip(dense_precisions(prior()), roots(), strict=True):
         covariance = 1e-3 * np.linalg.inv(chain) / norm + root @ root.T
         np.testing.assert_allclose(found @ covariance, np.eye(FRAMES), atol=1e-9)
 
@@ -57,14 +58,14 @@ def test_product_and_value_match_the_dense_precision() -> None:
         np.random.default_rng(0).standard_normal((FRAMES, 3, POINTS)),
     )
     assert given.quadratic is not None
-    product = np.einsum("cfg,gcp->fcp", given.quadratic.matrices(), shapes)
+    product = np.einsum("cfg,gcp->fcp", dense_precisions(given.quadratic), shapes)
     np.testing.assert_allclose(given.apply(shapes), product, atol=1e-10)
     assert given.quadratic.value(shapes) == pytest.approx(float((product * shapes).sum()), rel=1e-12)
 
 
 def test_the_loosest_directions_have_the_smallest_eigenvalues() -> None:
     found = prior().loosest(2)
-    for (directions, held), matrix in zip(found, prior().matrices(), strict=True):
+    for (directions, held), matrix in zip(found, dense_precisions(prior()), strict=True):
         values, vectors = np.linalg.eigh(matrix)
         np.testing.assert_allclose(held, values[:2], rtol=1e-2)
         np.testing.assert_allclose(np.abs(directions.T @ vectors[:, :2]), np.eye(2), atol=1e-2)

@@ -9,7 +9,7 @@ import pytest
 from pliant.solver import Settings, Tracks, gallery, solve
 from pliant.solver.cameras.perspective import MIRROR, Perspective, depth_map
 from pliant.solver.evaluation.metrics import e3d_frame_scaled
-from pliant.solver.model.expectation_maximisation import annealed
+from pliant.solver.model.expectation_maximisation import ModelOrder, annealed
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.refinement import depth_rounds
 from pliant.solver.refinement.depth_alternation import aligned, alternate, refactorize
@@ -52,7 +52,7 @@ def test_a_new_factorization_corrects_cameras_that_are_off(
     rotations, view, gram = rigid
     off = np.radians(degrees) * np.random.default_rng(2).normal(size=(12, 3))
     given = exponential(off) @ rotations
-    start = Learned(given, np.ones(12), annealed(gram, given[:, :2], iterations=30), np.inf)
+    start = Learned(given, np.ones(12), annealed(gram, given[:, :2], ModelOrder(), iterations=30), np.inf)
     used = np.arange(12)
     found, moved = alternate(view, start, used, Refinement())
     moved = replace(moved, depth=depth_map(found.rotations, found.scales, found.covariance))
@@ -66,7 +66,7 @@ def test_a_round_that_leads_to_extreme_depths_is_discarded(
     rigid: tuple[np.ndarray, Perspective, np.ndarray],
 ) -> None:
     rotations, view, gram = rigid
-    covariance = annealed(gram, rotations[:, :2], iterations=5)
+    covariance = annealed(gram, rotations[:, :2], ModelOrder(), iterations=5)
     given = Learned(rotations, np.ones(12), replace(covariance, mean_covariance=1e19 * np.eye(3)), np.inf)
     found, moved = alternate(view, given, np.arange(12), Refinement())
     assert found is given

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pliant.solver import gallery
 from pliant.solver.cameras.perspective import Perspective
+from pliant.solver.model.expectation_maximisation import ModelOrder
 from pliant.solver.model.marginal_likelihood import UNLIKELY
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.so3 import angles_between, exponential, logarithm, nearest
 from pliant.solver.records import Floats
 from pliant.solver.refinement.focal_length import _Comparison, search

@@ -10,11 +10,11 @@ import pytest
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import depth_map
 from pliant.solver.model.early_stopping import learn_with_early_stopping
-from pliant.solver.model.expectation_maximisation import annealed
-from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.model.expectation_maximisation import ModelOrder, annealed
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.records import Floats
-from pliant.solver.shapes.jackknife import MIN_LEARNED_POINTS, PARTS, learning_changes, parts
+from pliant.solver.pulse import never
+from pliant.solver.records import MIN_POINTS, Floats
+from pliant.solver.shapes.jackknife import PARTS, learning_changes, parts
 from pliant.solver.tracks.matrix import centred, columns
 from scipy.spatial.transform import Rotation
 
@@ -34,7 +34,7 @@ def seen(
     sample = np.einsum("fij,fpj->fpi", rotations[:, :2], shapes) + noise * rng.normal(size=(FRAMES, points, 2))
     rows = columns(centred(sample))
     gram = rows @ rows.T / points
-    covariance = annealed(gram, rotations[:, :2], iterations=40)
+    covariance = annealed(gram, rotations[:, :2], ModelOrder(), iterations=40)
     estimate = CameraEstimate(rotations, np.ones(FRAMES), np.zeros((FRAMES, 2)), 0, gram, sample)
     return estimate, covariance, shapes
 
@@ -46,7 +46,7 @@ def learning_std(
     *,
     turning: bool,
     observed: np.ndarray | None = None,
-    should_stop: Callable[[], bool] | None = None,
+    should_stop: Callable[[], bool] = never,
 ) -> Floats:
     observed = np.ones(estimate.sample.shape[:2], dtype=bool) if observed is None else observed
     found = learning_changes(estimate, covariance, observed, turning=turning, should_stop=should_stop)
@@ -120,7 +120,7 @@ def test_learning_std_is_interpolated_between_evaluated_frames(monkeypatch: pyte
 
 def test_too_few_points_or_a_stop_give_zero() -> None:
     estimate, covariance, shapes = seen(20)
-    few = replace(estimate, sample=estimate.sample[:, :MIN_LEARNED_POINTS])
+    few = replace(estimate, sample=estimate.sample[:, :MIN_POINTS])
     assert (learning_std(few, covariance, shapes, turning=True) == 0).all()
     assert (learning_std(estimate, covariance, shapes, turning=True, should_stop=lambda: True) == 0).all()
 

@@ -11,7 +11,7 @@ from pliant.solver.agreement import check_agreement
 from pliant.solver.evaluation.metrics import e3d_frame
 from pliant.solver.limits import MAX_UNORDERED_FRAMES
 from pliant.solver.model import full_mode_covariance
-from pliant.solver.model.expectation_maximisation import annealed
+from pliant.solver.model.expectation_maximisation import ModelOrder, annealed
 from pliant.solver.model.marginal_likelihood import Motion, Scene, energy, start
 from pliant.solver.model.so3 import exponential
 from pliant.solver.tracks.frame_order import (
@@ -126,7 +126,7 @@ def test_unordered_energies_are_invariant_to_frame_permutations() -> None:
                 motion, turns=motion.turns[places], log_scales=motion.log_scales[places], modes=motion.modes[places]
             )
             values[ordered].append(energy(scene, motion)[0])
-            covariance = annealed(scene.gram, rotations[places, :2], ordered=ordered, iterations=3)
+            covariance = annealed(scene.gram, rotations[places, :2], ModelOrder(ordered=ordered), iterations=3)
             values[ordered].append(covariance.nll)
             basis = full_mode_covariance.begin(scene, np.ones(frames), covariance)
             values[ordered].append(full_mode_covariance.energy(scene, covariance.axis_covariance, basis)[0])

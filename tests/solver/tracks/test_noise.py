@@ -7,9 +7,9 @@ import pytest
 from pliant.solver import KnownCamera, Settings, gallery, solve
 from pliant.solver.cameras.multistart import scaled_prior_weight
 from pliant.solver.evaluation import metrics
-from pliant.solver.model.expectation_maximisation import ANNEALING_START, START_NOISE_VARIANCE, begin, improve, learned
+from pliant.solver.model.expectation_maximisation import ANNEALING_START, ModelOrder, improve, learned, scratch
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT
-from pliant.solver.model.model_order import MIN_JUDGED_POINTS, ModelOrder, select_model_order
+from pliant.solver.model.model_order import MIN_JUDGED_POINTS, select_model_order
 from pliant.solver.model.so3 import exponential
 from pliant.solver.tracks.noise import roughness, typical_roughness, white_noise
 
@@ -82,15 +82,13 @@ def test_the_camera_prior_is_weaker_with_strong_noise() -> None:
 
 def test_strong_noise_is_learned_though_a_small_start_misses_it() -> None:
     gram = gram_of(tracks(500, modes=2, sigma=SIGMA))
-    small = improve(
-        begin(gram, PAIRS, noise_variance=START_NOISE_VARIANCE), gram, PAIRS, iterations=60, warm=ANNEALING_START
-    )
+    small = improve(scratch(gram, PAIRS, ModelOrder()), gram, PAIRS, iterations=60, warm=ANNEALING_START)
     assert small.noise_variance**0.5 < SIGMA / 3
-    assert learned(gram, PAIRS, max_modes=8, noisy_start=True).noise_variance ** 0.5 == pytest.approx(SIGMA, rel=0.15)
+    assert learned(gram, PAIRS, ModelOrder(8, noisy_start=True)).noise_variance ** 0.5 == pytest.approx(SIGMA, rel=0.15)
 
 
 def test_fine_deformation_is_not_learned_as_noise() -> None:
-    assert learned(gram_of(tracks(500, modes=6, sigma=0.0)), PAIRS).noise_variance ** 0.5 < 1e-3
+    assert learned(gram_of(tracks(500, modes=6, sigma=0.0)), PAIRS, ModelOrder()).noise_variance ** 0.5 < 1e-3
 
 
 @pytest.mark.slow
