@@ -11,7 +11,6 @@ from pliant.solver.cameras.estimation import (
     CameraEstimate,
     OtherCameras,
     estimate_cameras,
-    with_other_cameras,
 )
 from pliant.solver.cameras.multistart import CANDIDATES, SMOOTH_STARTS, depth
 from pliant.solver.model.so3 import angles_between, exponential, nearest
@@ -97,12 +96,3 @@ def test_the_start_that_leads_to_the_higher_likelihood_is_chosen(
     assert np.degrees(angles_between(found.rotations @ common, true)).mean() < 0.1
     assert found.basis_size == (7 if better == "rival" else 1)
     assert ("other rotations, from K = 7" in found.reasons.get("basis_size", "")) == (better == "rival")
-
-
-def test_a_chosen_candidate_with_little_rotation_gives_a_warning() -> None:
-    still = np.broadcast_to(np.eye(3), (FRAMES, 3, 3))
-    turning = exponential(np.linspace(0, 1, FRAMES)[:, None] * np.array([0.0, 1.0, 0.0]))
-    own = CameraEstimate(turning, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, np.zeros((0, 0)), np.zeros((FRAMES, 0, 2)))
-    found = with_other_cameras(own, OtherCameras(3, still, "others"))
-    assert found.warnings
-    assert not with_other_cameras(found, OtherCameras(1, turning, "others")).warnings
