@@ -8,6 +8,7 @@ the data; a skipped stage is dropped from the plan when a later one begins.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import log
 
 from pliant.solver.limits import learned_frames
 from pliant.solver.records import Floats
@@ -21,6 +22,10 @@ SHAPES_UNITS, UNITS_PER_UNSEEN_FRAME, MOST_SHAPES_UNITS = 55.0, 9.0, 300.0
 """Units of the stage `shapes`: where nothing is hidden, in addition per frame of `unseen_frames`, and at most. Where a point is hidden for
 ℓ frames, the equations link these frames in a chain, so conjugate gradients need more iterations and leave more to the next reweighting.
 Measured: 35 to 91, and 223 for points hidden for 18 frames in a row."""
+
+SHAPES_TOLERANCE = 1e-4
+"""Tolerance at which these units were measured. Reweighting converges linearly, so they grow with its logarithm: of a face of 40 × 800, 61,
+125, 212, 324 and 556 with 1e-2, 1e-4, 1e-6, 1e-8 and 1e-12."""
 
 ITERATION_FRAME_SECONDS, ITERATION_SECONDS = 2e-5, {True: 7e-8, False: 5e-8}
 """Seconds per unit of a reweighting: per frame, and in addition per frame and point; the key is whether a prior is learned. Within a factor
@@ -104,6 +109,7 @@ def planned(
     known_scales: bool = False,
     ordered: bool = True,
     unseen: float = 0.0,
+    tolerance: float = SHAPES_TOLERANCE,
 ) -> tuple[Stage, ...]:
     """Return the expected stages of a solve, in order.
 
@@ -125,9 +131,12 @@ def planned(
         Whether the tracks are tested for an isometric surface.
     unseen : float
         `unseen_frames` of the tracks.
+    tolerance : float
+        `Settings.tolerance`.
     """
     start = Stage("start", frames * (START_FRAME_SECONDS + START_SECONDS * points), START_UNITS)
     units = min(SHAPES_UNITS + UNITS_PER_UNSEEN_FRAME * unseen, MOST_SHAPES_UNITS)
+    units = max(1.0, units * log(tolerance) / log(SHAPES_TOLERANCE))
     seconds = frames * (ITERATION_FRAME_SECONDS + ITERATION_SECONDS[gaussian] * points)
     shapes = Stage("shapes", units * seconds, round(units))
     last = [Stage("finish", FINISH_SECONDS * frames * points, 3), *([stage_of("trust", frames)] if gaussian else [])]

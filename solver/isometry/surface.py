@@ -283,9 +283,8 @@ def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried) -> Isometric
     found = min(found, chosen.found, key=lambda each: each.inconsistency)
     if len(search.frames) < tracks.num_frames:
         found = refine(whole, _from_similar(whole, search, found.depths), should_stop=search.should_stop)
-    if (
-        not search.should_stop()
-    ):  # short edges only: the chord of a long one is shorter than the surface between its ends
+    if not search.should_stop():
+        # Short edges only: the chord of a long one is shorter than the surface between its ends.
         near = replace(
             whole, edges=nearest_neighbours(replace(search.anchors, seen=search.seen), neighbours=LAST_NEIGHBOURS)
         )

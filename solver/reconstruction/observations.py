@@ -146,6 +146,6 @@ def monitored(
     plan = planned(
         tracks.num_frames, tracks.num_points, gaussian=settings.gaussian, known_cameras=known is not None,
         known_scales=known is not None and known.scales is not None,
-        ordered=settings.order == "film", sheet=sheet, unseen=unseen,
+        ordered=settings.order == "film", sheet=sheet, unseen=unseen, tolerance=settings.tolerance,
     )  # fmt: skip
     return Monitor(on_step, should_stop, plan=[stage for stage in plan if not only or stage.name in only])

@@ -218,6 +218,16 @@ def test_long_hidden_gaps_are_planned_with_more_units() -> None:
     assert shapes(20).seconds > 4 * shapes(0).seconds
 
 
+def test_a_lower_tolerance_is_planned_with_more_units() -> None:
+    def shapes(tolerance: float) -> Stage:
+        plan = planned(40, 800, gaussian=False, known_cameras=True, sheet=False, tolerance=tolerance)
+        return next(stage for stage in plan if stage.name == "shapes")
+
+    assert [shapes(tolerance).units for tolerance in (1e-2, 1e-4, 1e-8)] == [28, 55, 110]
+    assert shapes(1e-8).seconds == pytest.approx(2 * shapes(1e-4).seconds)
+    assert shapes(0.999).units == 1
+
+
 class Clock:
     """A monitor of a plan whose units take given times."""
 

@@ -101,7 +101,9 @@ def solving_seconds(frames: int, points: int, options: Options) -> float:
     """Return the planned seconds of solving a film's tracks at a `MachinePace` of 1; the options contain the film's `image_size`."""
     settings = solver_settings(options)
     sheet = tries_isometry(None, settings)
-    stages = planned(frames, points, gaussian=settings.gaussian, known_cameras=False, sheet=sheet)
+    stages = planned(
+        frames, points, gaussian=settings.gaussian, known_cameras=False, sheet=sheet, tolerance=settings.tolerance
+    )
     return sum(stage.seconds for stage in stages)
 
 

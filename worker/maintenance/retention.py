@@ -83,7 +83,7 @@ class Retention:
         """Remove the jobs that have expired. A job that is not finished, or has no `expires_at`, is never touched.
 
         Unless `among_all`, only jobs that are older than the retention period are read. Others can have expired only if the period was
-        shorter when they ended. Reading 100,000 records takes more than half a minute.
+        shorter when they ended. Reading 10,000 records takes 4.5 s of processor time.
         """
         now, cursor = self.jobs.clock(), None
         if not among_all:
