@@ -20,7 +20,6 @@ from pliant.worker.errors import InvalidSetting, StoreUnavailable, WorkerError
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.logs import configure_logging
 from pliant.worker.settings import Settings
-from pliant.worker.store.schema import prepare
 from pliant.worker.tokens import Tokens
 
 _log = logging.getLogger("pliant.service")
@@ -105,9 +104,10 @@ def main(arguments: Sequence[str] = ()) -> int:
         tokens = Tokens.open(of_worker)
         check_access(settings, tokens)
         tracing.configure(of_worker.tracing, service="pliant-api")
+        jobs = Jobs.open(of_worker)
         with suppress(StoreUnavailable):  # requests are answered 503 until the store is back
-            prepare(of_worker)
-        app = create_app(Jobs.open(of_worker), settings, tokens=tokens)
+            jobs.records.ping()
+        app = create_app(jobs, settings, tokens=tokens)
     except WorkerError as error:
         sys.stderr.write(f"{error}\n")
         return 2

@@ -8,11 +8,10 @@ import os
 import secrets
 import signal
 import sys
-from contextlib import suppress
 from types import FrameType
 
 from pliant.worker.environment import read
-from pliant.worker.errors import StoreUnavailable, WorkerError
+from pliant.worker.errors import WorkerError
 from pliant.worker.execution.rq_worker import PliantWorker
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.logs import LogSettings, configure_logging
@@ -23,7 +22,6 @@ from pliant.worker.settings import NUMERICAL_THREADS, Settings
 from pliant.worker.store.connection import BLOCK_WITHIN, connect, reachable
 from pliant.worker.store.queue import RedisQueue
 from pliant.worker.store.redis import RedisRecords
-from pliant.worker.store.schema import prepare
 from pliant.worker.webhooks.sender import WebhookSender
 
 USAGE = "usage: python -m pliant.worker [work|reconcile|fsck]"
@@ -57,12 +55,14 @@ def work(settings: Settings) -> int:
         for decode in (False, True)
     )
     connection = connect(settings.redis, decode=False, answer_within=BLOCK_WITHIN)
-    with reachable():  # RQ connects at once; the supervisor repeats a start without a store
+    records = RedisRecords(text, prefix=settings.queue)
+    records.ping()  # the supervisor repeats a start without a store
+    with reachable():  # RQ connects at once
         worker = PliantWorker(
             settings=settings,
             connection=connection,
             quick=quick,
-            records=RedisRecords(text, prefix=settings.queue),
+            records=records,
             queue=RedisQueue(connection, name=settings.queue),
             name=secrets.token_hex(6),
         )
@@ -81,6 +81,7 @@ def reconcile(settings: Settings) -> int:
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
     jobs = Jobs.open(settings)
+    jobs.records.ping()  # the supervisor repeats a start without a store
     sender = WebhookSender.open(settings, jobs.records)
     sender.start()
     Reconciler(jobs=jobs).run(lambda: stopping or not sender.alive)  # the supervisor restarts a failed sender
@@ -105,8 +106,6 @@ def main(arguments: list[str]) -> int:
     try:
         logs, settings = read(LogSettings), Settings.from_environment()
         configure_logging(logs.log_level, logs.log_format)
-        with suppress(StoreUnavailable):  # each task handles an unavailable store itself
-            prepare(settings)
         return task(settings)
     except WorkerError as error:
         sys.stderr.write(f"{error}\n")

@@ -33,7 +33,7 @@ from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import order_waiting, push_or_hold
 from pliant.worker.records import Stored, utc_now
 from pliant.worker.settings import Settings
-from pliant.worker.store.schema import CURRENT, prepare
+from pliant.worker.store.schema import CURRENT
 from pliant.worker.store.snapshot import Snapshot
 
 FORMAT = 1
@@ -111,7 +111,6 @@ def restore_backup(settings: Settings, source: Path) -> Summary:
     """
     manifest = read_manifest(source)
     records, rest = _verified(source, manifest)
-    prepare(settings)
     snapshot, jobs = Snapshot(settings), Jobs.open(settings)
     if not snapshot.is_empty():
         raise BadBackup("The installation already has jobs or tokens. Restore into an empty one.")

@@ -8,17 +8,20 @@ Keys, all under one prefix::
     events:<id>, log:<id> stream and list, both capped
     key:<digest>          the job of an idempotency key
     used                  bytes of all jobs
+    schema                version of the records
     deleted               sorted set of deleted jobs whose files are still to be removed, by time of deletion
     changes               channel on which the id of every changed job is published
     tally                 hash: counters since the installation was created
     outbox, outbox:tries  jobs with a pending webhook and when it is due; number of attempts (`store.outbox`)
 
-Each write is one Lua script and therefore atomic, also in the append-only file.
+Each write is one Lua script and therefore atomic, also in the append-only file. Before the first use, the version of the records is
+checked (`store.schema`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import datetime
 from typing import Any
 
@@ -41,6 +44,7 @@ from pliant.worker.records import (
 )
 from pliant.worker.store.changes import RedisChanges
 from pliant.worker.store.connection import reachable
+from pliant.worker.store.schema import prepare
 
 # ARGV: 1 prefix, 2 id, 3 version, 4 status, 5 attempt id, 6 owner, 7 sort key, 8 bytes, 9 key digest, 10 body, 11 event, 12 data, 13 cap,
 # 14 maximum queued jobs of the owner (0: no limit), 15 maximum running ones by the owner's token ('': not set),
@@ -135,17 +139,27 @@ class RedisRecords(Records):
 
     def __init__(self, client: redis.Redis, *, prefix: str) -> None:
         self._redis: Any = client  # redis-py types every reply as a union with its awaitable counterpart
-        self._at = f"{prefix}:"
+        self._prefix, self._at = prefix, f"{prefix}:"
+        self._is_current = False
         self._create = client.register_script(_CREATE)
         self._replace = client.register_script(_REPLACE)
         self._delete = client.register_script(_DELETE)
         self._beat = client.register_script(_BEAT)
         self._log = client.register_script(_LOG)
 
+    @contextmanager
+    def _checked(self) -> Iterator[None]:
+        """Translate errors of the store; before the first use, check the version of the records and migrate older ones."""
+        with reachable():
+            if not self._is_current:
+                prepare(self._redis, self._prefix)
+                self._is_current = True
+            yield
+
     def create(self, stored: Stored, *, max_queued: int = 0, max_bytes: int = 0) -> Stored:
         event, job = event_of(None, stored), stored.job
         assert event is not None
-        with reachable():
+        with self._checked():
             taken = self._create(
                 args=[
                     self._at, job.id, stored.version, job.status.value, stored.attempt_id, stored.owner, stored.sort_key,
@@ -165,14 +179,14 @@ class RedisRecords(Records):
             return self.create(stored, max_queued=max_queued, max_bytes=max_bytes)
 
     def get(self, id: str) -> Stored:
-        with reachable():
+        with self._checked():
             body = self._redis.hget(f"{self._at}job:{id}", "body")
         if body is None:
             raise UnknownJob(id)
         return Stored.model_validate_json(body)
 
     def find(self, key: str) -> Stored | None:
-        with reachable():
+        with self._checked():
             id = self._redis.get(f"{self._at}key:{key}")
         try:
             return None if id is None else self.get(id)
@@ -182,7 +196,7 @@ class RedisRecords(Records):
     def replace(self, before: Stored, after: Stored) -> bool:
         name, data = event_of(before, after) or ("", "")
         job, due = after.job, webhook_due(before, after)
-        with reachable():
+        with self._checked():
             written = self._replace(
                 args=[
                     self._at, job.id, before.version, after.version, job.status.value, after.attempt_id, after.bytes,
@@ -193,23 +207,23 @@ class RedisRecords(Records):
         return bool(written)
 
     def delete(self, stored: Stored, *, at: datetime) -> None:
-        with reachable():
+        with self._checked():
             self._delete(args=[self._at, stored.job.id, milliseconds(at), stored.attempt_id])
 
     def deleted(self) -> dict[str, datetime]:
-        with reachable():
+        with self._checked():
             found = self._redis.zrange(f"{self._at}deleted", 0, -1, withscores=True)
         return {id: moment(int(at)) for id, at in found}
 
     def forget_deleted(self, id: str) -> None:
-        with reachable():
+        with self._checked():
             self._redis.zrem(f"{self._at}deleted", id)
 
     def page(
         self, *, cursor: str | None, limit: int, statuses: Sequence[Status], owner: str | None
     ) -> tuple[list[Stored], str | None]:
         newest = "+" if cursor is None else f"({cursor}"
-        with reachable():
+        with self._checked():
             pipe = self._redis.pipeline(transaction=False)
             for status in dict.fromkeys(statuses):
                 pipe.zrevrangebylex(self._index(owner, status), newest, "-", start=0, num=limit + 1)
@@ -222,7 +236,7 @@ class RedisRecords(Records):
         return page, keys[limit - 1] if len(keys) > limit else None
 
     def ids(self, *statuses: Status) -> list[str]:
-        with reachable():
+        with self._checked():
             pipe = self._redis.pipeline(transaction=True)
             for status in statuses:
                 pipe.zrange(self._index(None, status), 0, -1)
@@ -230,35 +244,35 @@ class RedisRecords(Records):
         return [key.split(":", 1)[1] for keys in found for key in keys]
 
     def count(self, statuses: Sequence[Status], *, owner: str | None = None) -> int:
-        with reachable():
+        with self._checked():
             return sum(self._redis.zcard(self._index(owner, status)) for status in dict.fromkeys(statuses))
 
     def oldest(self, status: Status) -> datetime | None:
-        with reachable():
+        with self._checked():
             first = self._redis.zrange(self._index(None, status), 0, 0)
         return moment(int(first[0].split(":", 1)[0])) if first else None
 
     def tallies(self) -> dict[str, float]:
-        with reachable():
+        with self._checked():
             return {name: float(value) for name, value in self._redis.hgetall(f"{self._at}tally").items()}
 
     def used(self) -> int:
-        with reachable():
+        with self._checked():
             return int(self._redis.get(f"{self._at}used") or 0)
 
     def beat(self, id: str, attempt_id: str) -> Status | None:
-        with reachable():
+        with self._checked():
             status = self._beat(args=[self._at, id, attempt_id])
         return None if status is None else Status(str(status))
 
     def look(self, id: str, attempt_id: str) -> Status | None:
-        with reachable():
+        with self._checked():
             held, status = self._redis.hmget(f"{self._at}job:{id}", "token", "status")
         return Status(status) if held == attempt_id else None
 
     def beats(self, ids: Iterable[str]) -> dict[str, Beat]:
         wanted = list(ids)
-        with reachable():
+        with self._checked():
             pipe = self._redis.pipeline(transaction=False)
             for id in wanted:
                 pipe.hmget(f"{self._at}job:{id}", "token", "beat", "owner", "most", "priority")
@@ -270,24 +284,24 @@ class RedisRecords(Records):
         }
 
     def events(self, id: str, *, after: str | None) -> list[Event]:
-        with reachable():
+        with self._checked():
             entries = self._redis.xrange(f"{self._at}events:{id}", min="-" if after is None else f"({after}", max="+")
         return [Event(entry, fields["name"], fields["data"]) for entry, fields in entries]
 
     def changes(self) -> Changes:
-        return RedisChanges(self._redis, prefix=self._at.removesuffix(":"))
+        return RedisChanges(self._redis, prefix=self._prefix)
 
     def append_log(self, id: str, lines: Sequence[str]) -> None:
         if lines:
-            with reachable():
+            with self._checked():
                 self._log(args=[self._at, id, LOG_KEPT, *lines[-LOG_KEPT:]])
 
     def log(self, id: str) -> list[str]:
-        with reachable():
+        with self._checked():
             return list(self._redis.lrange(f"{self._at}log:{id}", 0, -1))
 
     def ping(self) -> None:
-        with reachable():
+        with self._checked():
             self._redis.ping()
 
     def _index(self, owner: str | None, status: Status) -> str:

@@ -1,7 +1,7 @@
 """Version of the stored records, and migrations from older versions.
 
-Every process that writes checks the version when it starts. Older data is migrated once; newer data is rejected, because an older
-program could drop fields that it does not know.
+`RedisRecords` checks the version before its first use. Older data is migrated once; newer data is rejected, because an older program
+could drop fields that it does not know.
 """
 
 from __future__ import annotations
@@ -12,9 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import redis
-from pliant.worker.errors import NewerData
-from pliant.worker.settings import Settings
-from pliant.worker.store.connection import connect, reachable
+from pliant.worker.errors import NewerData, StoreUnavailable
 
 logger = logging.getLogger(__name__)
 
@@ -61,7 +59,7 @@ def migrated(body: dict[str, Any]) -> dict[str, Any]:
     return body
 
 
-def prepare(settings: Settings) -> int:
+def prepare(client: Any, prefix: str) -> int:
     """Migrate an installation's records to the current version; return how many were rewritten.
 
     Raises
@@ -69,29 +67,25 @@ def prepare(settings: Settings) -> int:
     NewerData
         The records were written by a newer version.
     StoreUnavailable
-        The store does not answer.
+        Another process still migrates the records.
     """
-    client: Any = connect(settings.redis, decode=True)
-    at = f"{settings.queue}:"
+    at = f"{prefix}:"
+    version = int(client.get(f"{at}schema") or 0)
+    if version == CURRENT:
+        return 0
+    if version > CURRENT:
+        raise NewerData(found=version, known=CURRENT)
+    count = 0
     try:
-        with reachable():
-            version = int(client.get(f"{at}schema") or 0)
-            if version == CURRENT:
+        with client.lock(f"{at}migrating", timeout=_LOCK_SECONDS, blocking_timeout=_LOCK_SECONDS):
+            if int(client.get(f"{at}schema") or 0) == CURRENT:  # another process was quicker
                 return 0
-            if version > CURRENT:
-                raise NewerData(found=version, known=CURRENT)
-            with client.lock(f"{at}migrating", timeout=_LOCK_SECONDS, blocking_timeout=_LOCK_SECONDS):
-                if int(client.get(f"{at}schema") or 0) == CURRENT:  # another process was quicker
-                    return 0
-                count = _rewrite(client, at)
-                client.set(f"{at}schema", CURRENT)
+            count = _rewrite(client, at)
+            client.set(f"{at}schema", CURRENT)
     except redis.exceptions.LockNotOwnedError:
         logger.warning("the migration took longer than its lock lasts; another process may have repeated it")
     except redis.exceptions.LockError as error:
-        logger.warning("another process still migrates the records: %s", error)
-        return 0
-    finally:
-        client.close()
+        raise StoreUnavailable("The job store", reason="another process still migrates the records") from error
     if count:
         logger.info("migrated %d job records from version %d to %d", count, version or 1, CURRENT)
     return count

@@ -331,7 +331,6 @@ def test_a_service_whose_stores_cannot_be_opened_does_not_start(
     monkeypatch.setenv("PLIANT_DATA", str(tmp_path))
     monkeypatch.setenv(f"PLIANT_{name}", given)
     monkeypatch.setattr(process, "configure_logging", lambda *_: None)
-    monkeypatch.setattr(process, "prepare", lambda _: None)
     assert process.main() == 2
     assert capsys.readouterr().err.startswith(sentence)
 
