@@ -16,13 +16,14 @@ from pliant.worker.errors import Interrupted
 from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.sources import FilmSource
 from pliant.worker.formats.cost import estimated
-from pliant.worker.formats.errors import damaged, too_large
+from pliant.worker.formats.errors import damaged, refusal_in, too_large
 from pliant.worker.formats.solver_settings import solver_settings
 from pliant.worker.formats.unused_options import notes_on_options
-from pliant.worker.processes.contained import DONE, REFUSED, Ended, refusal_in, run_contained
+from pliant.worker.processes.contained import DONE, REFUSED, Ended, run_contained
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 MODULE = "pliant.worker.films.contained_process"
+INCONSISTENT = "a film that its decoder cannot read consistently"
 TRACKING_OPTIONS = {"frames", "template_frame", "grid_step", "longest_side", "region_frame", "region_polygon"}
 """Job options that the film process uses."""
 
@@ -283,17 +284,13 @@ def _answer(kind: type[Answer], ended: Ended, bounds: FilmBounds, seconds: float
         try:
             return kind.model_validate_json(ended.answer)
         except ValidationError:
-            raise damaged("film", "a film that its decoder cannot read consistently") from None
+            raise damaged("film", INCONSISTENT) from None
     raise _fault(ended, bounds, seconds)
 
 
 def _fault(ended: Ended, bounds: FilmBounds, seconds: float) -> Exception:
     if ended.code == REFUSED:
-        parts = refusal_in(ended)
-        if parts is None:
-            return damaged("film", "a film that its decoder cannot read consistently")
-        del parts["choices"]
-        return InvalidInput(parts.pop("code"), **parts)
+        return refusal_in(ended.answer) or damaged("film", INCONSISTENT)
     if ended.overdue or ended.code == -signal.SIGXCPU:
         return InvalidInput(
             "too_slow", field="film", expected=f"a film that is decoded and tracked within {seconds:g} s", got="one that takes longer",

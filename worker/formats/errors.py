@@ -10,9 +10,11 @@ too_large, too_slow, transposed_grid, unknown_format, unsupported_feature, verte
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
+from pliant.schemas.invalid import SIDES
 from pliant.solver import InvalidInput
 
 FULL = "a full matrix of real numbers, such as W"
@@ -63,3 +65,18 @@ def damaged(field: str, what: str) -> InvalidInput:
     return InvalidInput(
         "damaged_file", field=field, expected="a complete, consistent file", got=what, hint="Write the file again."
     )
+
+
+def refusal_in(answer: bytes, *, with_choices: bool = False) -> InvalidInput | None:
+    """Return the error that a contained process answered, None if the answer states none.
+
+    `with_choices` believes its `choices`, which nothing checks.
+    """
+    try:
+        stated = json.loads(answer)
+        parts = {name: str(stated[name]) for name in ("code", *SIDES)}
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
+    if with_choices and stated.get("choices") is not None:
+        return AmbiguousInput(**parts, choices=stated["choices"])
+    return InvalidInput(**parts)

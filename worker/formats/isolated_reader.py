@@ -23,12 +23,12 @@ from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.worker.formats.canonical import load_inputs, save_inputs
-from pliant.worker.formats.errors import AmbiguousInput, too_large
+from pliant.worker.formats.errors import refusal_in, too_large
 from pliant.worker.formats.read import check_options, read_inputs
 from pliant.worker.formats.reading.arrays import NPY_MAGIC, UNREADABLE_ZIP, check_directory, read_header
 from pliant.worker.formats.reading.parsers import HDF5
 from pliant.worker.formats.records import Limits
-from pliant.worker.processes.contained import DONE, REFUSED, limit_process, refusal_in, run_contained, serve
+from pliant.worker.processes.contained import DONE, REFUSED, limit_process, run_contained, serve
 
 LARGE = 16 << 20
 """Bytes of arrays, as the files declare them, above which the isolated reader is used."""
@@ -161,13 +161,8 @@ def _in_process(parts: dict[str, Any], options: Options, limits: Limits, target:
         raise too_large("tracks", expected=f"inputs that are read within {limits.read_seconds:g} s", got="more")
     if ended.code in (-signal.SIGKILL, -signal.SIGXCPU):
         raise _too_much_memory(limits)
-    parts_of_refusal = refusal_in(ended) if ended.code == REFUSED else None
-    if parts_of_refusal is None:
-        raise RuntimeError(f"the isolated reader ended with {ended.code}: {ended.errors}")
-    choices = parts_of_refusal.pop("choices")
-    if choices is not None:
-        raise AmbiguousInput(**parts_of_refusal, choices=choices)
-    raise InvalidInput(parts_of_refusal.pop("code"), **parts_of_refusal)
+    refusal = refusal_in(ended.answer, with_choices=True) if ended.code == REFUSED else None
+    raise refusal or RuntimeError(f"the isolated reader ended with {ended.code}: {ended.errors}")
 
 
 def _too_much_memory(limits: Limits) -> InvalidInput:

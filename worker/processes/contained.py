@@ -21,7 +21,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from pliant.schemas.invalid import SIDES, Invalid, members_of
+from pliant.schemas.invalid import Invalid, members_of
 from pliant.worker.processes.containment import die_with_parent
 
 DONE, REFUSED, DISK_FULL = 0, 3, 4
@@ -175,16 +175,6 @@ class _Progress:
                 continue
             if isinstance(stated, dict):
                 self._on_line(stated)
-
-
-def refusal_in(ended: Ended) -> dict[str, Any] | None:
-    """Return the attributes of the error that a process wrote, including `choices`; None if they cannot be read."""
-    try:
-        stated = json.loads(ended.answer)
-        parts: dict[str, Any] = {name: str(stated[name]) for name in ("code", *SIDES)}
-    except (ValueError, KeyError, TypeError):
-        return None
-    return parts | {"choices": stated.get("choices")}
 
 
 def serve(handle: Callable[[dict[str, Any]], str]) -> int:

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import IO, Any
 
 from pliant.solver.errors import InvalidInput
-from pliant.worker.formats.errors import damaged
+from pliant.worker.formats.errors import damaged, refusal_in
 from pliant.worker.formats.records import Arrays, Limits
-from pliant.worker.processes.contained import DONE, REFUSED, Ended, limit_process, refusal_in, run_contained, serve
+from pliant.worker.processes.contained import DONE, REFUSED, Ended, limit_process, run_contained, serve
 
 MODULE = "pliant.worker.formats.reading.sandbox"
 
@@ -73,11 +73,7 @@ def _received(ended: Ended, output: Path, *, field: str, limits: Limits) -> Arra
 
 def _fault(ended: Ended, *, field: str, limits: Limits) -> InvalidInput:
     if ended.code == REFUSED:
-        parts = refusal_in(ended)
-        if parts is None:
-            return damaged(field, "a file that its reader cannot process")
-        del parts["choices"]
-        return InvalidInput(parts.pop("code"), **parts)
+        return refusal_in(ended.answer) or damaged(field, "a file that its reader cannot process")
     if ended.overdue or ended.code in (-signal.SIGXCPU, -signal.SIGKILL):
         return InvalidInput(
             "too_slow", field=field, expected=f"a file that is read within {limits.parse_seconds:g} s", got="one that takes longer",
