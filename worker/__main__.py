@@ -1,4 +1,4 @@
-"""`python -m pliant.worker [work|reconcile|fsck]`: run a worker, a reconciler or a check, configured by `PLIANT_…` variables."""
+"""`python -m pliant.worker [work|reconcile]`: run a worker or a reconciler, configured by `PLIANT_…` variables."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from pliant.worker.errors import WorkerError
 from pliant.worker.execution.rq_worker import PliantWorker
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.logs import LogSettings, configure_logging
-from pliant.worker.maintenance.fsck import findings
 from pliant.worker.maintenance.reconciler import Reconciler
 from pliant.worker.paths import make_data_directory
 from pliant.worker.settings import NUMERICAL_THREADS, Settings
@@ -24,7 +23,7 @@ from pliant.worker.store.queue import RedisQueue
 from pliant.worker.store.redis import RedisRecords
 from pliant.worker.webhooks.sender import WebhookSender
 
-USAGE = "usage: python -m pliant.worker [work|reconcile|fsck]"
+USAGE = "usage: python -m pliant.worker [work|reconcile]"
 
 PRELOADED = (
     "pliant.worker.formats.canonical",
@@ -89,16 +88,9 @@ def reconcile(settings: Settings) -> int:
     return 0
 
 
-def fsck(settings: Settings) -> int:
-    """Print inconsistencies between stores and records; return 1 if there are any."""
-    found = findings(Jobs.open(settings))
-    sys.stdout.writelines(f"{finding}\n" for finding in found or ["The stores are consistent with the job records."])
-    return 1 if found else 0
-
-
 def main(arguments: list[str]) -> int:
     """Run one process; return its exit code."""
-    tasks = {"work": work, "reconcile": reconcile, "fsck": fsck}
+    tasks = {"work": work, "reconcile": reconcile}
     task = tasks.get(arguments[0] if arguments else "work")
     if task is None or len(arguments) > 1:
         sys.stderr.write(f"{USAGE}\n")

@@ -217,7 +217,7 @@ class Hosts:
         """Return the jobs that are lost, those that exist without an acknowledgement, and what is left over in the end."""
         found = [f"working files on {host}: {self.at_work(host)}" for host in WORKER_HOSTS if not self._cleared(host)]
         fsck = subprocess.run(
-            self.network.command("front", [sys.executable, "-m", "pliant.worker", "fsck"]),
+            self.network.command("front", [sys.executable, "-m", "pliant.cli", "fsck"]),
             env={**self.environment, "PLIANT_DATA": str(self.folder / "front" / "data")}, capture_output=True, text=True, timeout=60,
         )  # fmt: skip
         if fsck.returncode != 0:

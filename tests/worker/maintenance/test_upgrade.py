@@ -173,7 +173,7 @@ def test_a_service_whose_store_was_away_serves_no_data_of_a_newer_version(
         assert http.get("/v1/jobs").json()["code"] == "newer_data"
 
 
-@pytest.mark.parametrize("task", ["work", "reconcile", "fsck"])
+@pytest.mark.parametrize("task", ["work", "reconcile"])
 def test_a_worker_does_not_start_without_its_store(
     task: str, away: tuple[Settings, Callable[[], None]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
