@@ -14,7 +14,7 @@ from pliant.worker.errors import Conflict, NotAllowedNow, StoreUnavailable, TooM
 from pliant.worker.ids import check_id, is_id, new_attempt_id, new_job_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.admission import check_fits
-from pliant.worker.jobs.submission import Acceptance, Submission, folder_of, key_digest
+from pliant.worker.jobs.submission import Submission, accept, folder_of, key_digest
 from pliant.worker.jobs.validation import check_event_id, check_key, check_page
 from pliant.worker.paths import make_data_directory
 from pliant.worker.records import Event, Records, Stored, utc_now
@@ -321,8 +321,6 @@ class Jobs:
         `put` stores `size` bytes: the inputs under the given blob key and, with `from_result`, the stored result beside them.
         `owner` defaults to the owner of these jobs.
         """
-        acceptance = Acceptance(records=self.records, blobs=self.blobs, queue=self.queue, settings=self.settings)
-        acceptance.check_quota(size)
         attempt_id = new_attempt_id(job.id)
         stored = Stored(
             job=job,
@@ -337,7 +335,7 @@ class Jobs:
             trace=tracing.traceparent(),
             max_running=self.max_running,
         )
-        kept = acceptance.create(stored, put, max_queued=self.max_queued)
+        kept = accept(self, stored, put)
         new = kept.inputs == stored.inputs
         return self._placed(kept) if new else self._same(kept, submission, wanted=job.id), new
 

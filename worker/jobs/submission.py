@@ -5,15 +5,17 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from pliant.schemas.job import Priority, Status
 from pliant.schemas.options import Options
 from pliant.worker.errors import QuotaExceeded, StoreUnavailable, TooManyQueued
 from pliant.worker.records import Records, Stored, Webhook
-from pliant.worker.settings import Settings
-from pliant.worker.store.blobs import Blobs
 from pliant.worker.store.queue import Queue
 from pliant.worker.uploads.shared import open_uploads
+
+if TYPE_CHECKING:
+    from pliant.worker.jobs.service import Jobs
 
 RANKS: dict[Priority, int] = {"high": 0, "normal": 1, "low": 2}
 """Queue rank of each priority; smaller ranks run first."""
@@ -27,18 +29,18 @@ def order_waiting(records: Records, queue: Queue, owners: Collection[str]) -> No
         queue.order({each.attempt_id: RANKS[each.priority] for each in beats if each.owner == owner})
 
 
-def push_or_hold(stored: Stored, records: Records, queue: Queue, settings: Settings) -> bool:
+def push_or_hold(jobs: Jobs, stored: Stored) -> bool:
     """Queue a stored job, or hold it back until its owner has fewer running jobs; return whether it was queued.
 
     The reconciler queues jobs that are held back. Jobs are counted after the record is written, so that simultaneous submissions
     count each other.
     """
-    most = settings.max_running if stored.max_running is None else stored.max_running
+    most = jobs.settings.max_running if stored.max_running is None else stored.max_running
     unfinished = (Status.QUEUED, Status.RUNNING, Status.CANCELLING)
-    if 0 < most < records.count(unfinished, owner=stored.owner):
-        queue.hold(stored.attempt_id)
+    if 0 < most < jobs.records.count(unfinished, owner=stored.owner):
+        jobs.queue.hold(stored.attempt_id)
         return False
-    queue.push(stored.job.id, stored.attempt_id)
+    jobs.queue.push(stored.job.id, stored.attempt_id)
     return True
 
 
@@ -68,57 +70,41 @@ class Submission:
     """Order among the waiting jobs of the owner."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Acceptance:
-    """Creates jobs in the stores."""
+def accept(jobs: Jobs, stored: Stored, put: Callable[[str], object]) -> Stored:
+    """Store inputs, record and queue entry, in this order; a failure in between leaves no accepted job.
 
-    records: Records
-    blobs: Blobs
-    queue: Queue
-    settings: Settings
+    `put` stores the inputs under a blob key. Returns the new record, or the one that already has its idempotency key or id.
 
-    def check_quota(self, more: int) -> None:
-        """Check that `more` bytes fit into the disk quota beside jobs, uploads and reservations.
-
-        Raises
-        ------
-        QuotaExceeded
-            The quota would be exceeded.
-        """
-        quota = self.settings.disk_quota
-        if quota > 0 and (used := self.records.used() + self._uploaded()) + more > quota:
-            raise QuotaExceeded(used=used, quota=quota)
-
-    def create(self, stored: Stored, put: Callable[[str], object], *, max_queued: int) -> Stored:
-        """Store inputs, record and queue entry, in this order; a failure in between leaves no accepted job.
-
-        `put` stores the inputs under a blob key. Returns the new record, or the one that already has its idempotency key or id.
-
-        Raises
-        ------
-        TooManyQueued, QuotaExceeded
-            A limit is reached; nothing is stored.
-        """
-        put(stored.inputs)
-        quota = self.settings.disk_quota
-        most = max(1, quota - self._uploaded()) if quota > 0 else 0
-        try:
-            kept = self.records.create(stored, max_queued=max_queued, max_bytes=most)
-        except (TooManyQueued, QuotaExceeded):
-            self.blobs.delete(folder_of(stored.inputs))
-            raise
-        if kept.inputs != stored.inputs:
-            self.blobs.delete(folder_of(stored.inputs))
-            return kept
-        try:
-            if push_or_hold(stored, self.records, self.queue, self.settings) and stored.job.priority != "normal":
-                order_waiting(self.records, self.queue, [stored.owner])
-        except StoreUnavailable:
-            return kept  # the record is stored, and the reconciler adds the missing queue entry
+    Raises
+    ------
+    TooManyQueued
+        The owner's limit on queued jobs is reached; nothing is stored.
+    QuotaExceeded
+        The job does not fit into the disk quota beside jobs, uploads and reservations; nothing is stored.
+    """
+    quota = jobs.settings.disk_quota
+    if quota > 0 and (used := jobs.records.used() + _uploaded(jobs)) + stored.bytes > quota:
+        raise QuotaExceeded(used=used, quota=quota)
+    put(stored.inputs)
+    most = max(1, quota - _uploaded(jobs)) if quota > 0 else 0
+    try:
+        kept = jobs.records.create(stored, max_queued=jobs.max_queued, max_bytes=most)
+    except (TooManyQueued, QuotaExceeded):
+        jobs.blobs.delete(folder_of(stored.inputs))
+        raise
+    if kept.inputs != stored.inputs:
+        jobs.blobs.delete(folder_of(stored.inputs))
         return kept
+    try:
+        if push_or_hold(jobs, stored) and stored.job.priority != "normal":
+            order_waiting(jobs.records, jobs.queue, [stored.owner])
+    except StoreUnavailable:
+        return kept  # the record is stored, and the reconciler adds the missing queue entry
+    return kept
 
-    def _uploaded(self) -> int:
-        return open_uploads(self.settings, self.blobs).used()
+
+def _uploaded(jobs: Jobs) -> int:
+    return open_uploads(jobs.settings, jobs.blobs).used()
 
 
 def folder_of(inputs: str) -> str:

@@ -169,7 +169,7 @@ def _requeue(jobs: Jobs, stored: Stored) -> None:
         with suppress(StaleAttempt):
             stored = jobs.records.update(stored.job.id, change)
     if stored.job.status is Status.QUEUED:
-        push_or_hold(stored, jobs.records, jobs.queue, jobs.settings)
+        push_or_hold(jobs, stored)
 
 
 def read_manifest(source: Path) -> dict[str, Any]:
