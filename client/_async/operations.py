@@ -25,7 +25,7 @@ from pliant.schemas.job import Job
 from pliant.schemas.options import Options
 
 WAITED = re.compile(r"wait=0*[1-9]")
-"""`Preference-Applied` of a service that delays its answers."""
+"""`Preference-Applied` of a service that grants a wait."""
 
 OnJob = Callable[[Job], None]
 """Called with the job each time its record changes."""
@@ -49,8 +49,8 @@ async def submit(
     if not isinstance(name, str):
         raise BadArgument(f"name: expected a str, got a value of type {type(name).__name__}.")
     texts = {
-        "name": name.encode("utf-8", "replace").decode(), "webhook": webhook or "", "webhook_secret": webhook_secret or "",
-        "priority": "" if priority == "normal" else priority,  # omitted for services without priorities
+        "name": name.encode("utf-8", "replace").decode(), "priority": priority, "webhook": webhook or "",
+        "webhook_secret": webhook_secret or "",
     }  # fmt: skip
     fields = option_fields(options) | {key: text for key, text in texts.items() if text != ""}
     whole = await in_thread(partial(inputs.form, folder, fields, exchange.attempts.bounding(on_upload)))
@@ -79,8 +79,7 @@ async def submit(
 async def wait(exchange: Exchange, job: str, *, on_progress: OnJob | None) -> Job:
     """Return the job once its status is final.
 
-    With `on_progress` the client follows the event stream. Without it, it sends `Prefer: wait`, and polls a service that
-    does not support this header.
+    With `on_progress` the client follows the event stream. Without it, it sends `Prefer: wait`, and polls a service that grants none.
     """
     path = job_path(job)
     if on_progress is not None:

@@ -25,8 +25,7 @@ from pliant.schemas.job import Upload
 def upload_large(exchange: Exchange, form: Form, key: str) -> Form:
     """Upload the large files of a form and return the form that refers to them.
 
-    The form is returned unchanged if its files are small or the service does not support uploads. With the same `key` and
-    content, the bytes that an earlier run uploaded are reused.
+    A form whose files are small is returned unchanged. With the same `key` and content, the bytes that an earlier run uploaded are reused.
     """
     if form.size <= multipart.RESUMABLE_BYTES:
         return form
@@ -42,16 +41,15 @@ def upload_large(exchange: Exchange, form: Form, key: str) -> Form:
             continue
         digest = in_place(partial(sha256, path))
         upload_id = hashlib.sha256(f"{key}\n{part}\n{digest}".encode()).hexdigest()[:40]
-        if not upload(exchange, path, upload_id, digest=digest, report=report):
-            return form
+        upload(exchange, path, upload_id, digest=digest, report=report)
         del files[part]
         fields[f"{part}_upload"] = upload_id
         before += size
     return replace(form, fields=fields, files=files, before=before)
 
 
-def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str, report: Callable[[int], None]) -> bool:
-    """Upload a file, starting after the last stored byte; return False if the service does not support uploads.
+def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str, report: Callable[[int], None]) -> None:
+    """Upload a file, starting after the last stored byte.
 
     Each stored byte counts as success, so the client does not give up on a poor connection that makes progress.
     """
@@ -59,11 +57,9 @@ def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str, repor
     encoded = base64.b64encode(bytes.fromhex(digest)).decode()
     while True:
         held = _state(exchange, upload_id)
-        if held is None:
-            return False
         if held.complete:
             report(size)
-            return True
+            return
         if held.offset > reached:
             reached = held.offset
             attempts.succeeded()
@@ -77,7 +73,7 @@ def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str, repor
                 response.read()
                 response.close()
                 attempts.succeeded()
-                return True
+                return
             fault = refusal(response)
         except httpx.TransportError as lost:
             fault = lost
@@ -96,15 +92,17 @@ def delete_uploads(exchange: Exchange, form: Form) -> None:
                 response.close()
 
 
-def _state(exchange: Exchange, upload_id: str) -> Upload | None:
-    """Return the state of an upload, or None if the service does not support uploads. Does not count as success."""
+def _state(exchange: Exchange, upload_id: str) -> Upload:
+    """Return the state of an upload, which need not have begun. Does not count as success."""
     call = Call(method="GET", path=_path(upload_id))
     while True:
         try:
             with exchange.stream(call) as response:
                 return parse(Upload, response.read(), response.status_code)
         except NotFound as missing:
-            return Upload(id=upload_id, offset=0, complete=False) if missing.code == "unknown_upload" else None
+            if missing.code != "unknown_upload":
+                raise
+            return Upload(id=upload_id, offset=0, complete=False)
         except httpx.TransportError as lost:
             exchange.pause_or_raise(call, lost)
 

@@ -92,23 +92,6 @@ def test_bytes_sent_by_an_earlier_run_are_not_sent_again(
     assert whole[0] > 0, "it goes on where the first run was given up"
 
 
-def test_a_service_without_uploads_receives_a_single_post() -> None:
-    class Older(InMemoryService):
-        def handle_request(self, request: httpx.Request) -> httpx.Response:
-            if "/uploads/" not in request.url.path:
-                return super().handle_request(request)
-            self.requests.append(request)
-            problem = '{"title": "Not found", "status": 404, "code": "no_such_address", "detail": "Nothing here."}'
-            return httpx.Response(404, text=problem, headers={"Content-Type": "application/problem+json"})
-
-    older = Older()
-    assert (
-        Client("http://pliant.test", transport=older).submit(POINTS, mesh="none").record.interpretation.num_points
-        == 15_000
-    )
-    assert [request.method for request in older.requests] == ["GET", "POST"]
-
-
 def test_an_expired_upload_is_sent_again() -> None:
     class Forgetful(InMemoryService):
         forgets = 1
