@@ -219,7 +219,7 @@ def running(folder: Path) -> Iterator[str]:
         )  # fmt: skip
         try:
             assert process.stdout is not None
-            url = announced(process.stdout)
+            url = read_address(process.stdout)
             if url is None:
                 process.wait(STOPS_WITHIN)
                 raise Unreachable(
@@ -242,7 +242,7 @@ def why(log: str) -> str:
         return " / ".join(log.splitlines()[-6:])
 
 
-def announced(stream: IO[str]) -> str | None:
+def read_address(stream: IO[str]) -> str | None:
     """Read the address from the output of `pliant up --json`; None if it ends without one."""
     text = ""
     for line in stream:

@@ -19,7 +19,7 @@ from pliant.cli.extras import missing_modules, require_server
 from pliant.cli.paths import installation
 from pliant.cli.session import HOME, Json, Session, Url
 from pliant.cli.show import out, print_json
-from pliant.cli.up import Data, chosen
+from pliant.cli.up import Data, read_settings
 
 if TYPE_CHECKING:
     from pliant.worker.settings import Settings
@@ -83,7 +83,7 @@ def fsck(ctx: typer.Context, data: Data = None, as_json: Json = False) -> None:
     session: Session = ctx.obj
     session.json = as_json
     require_server("pliant fsck")
-    settings = chosen(data, None)
+    settings = read_settings(data, None)
     installation(settings)
     report(list(check_stored(settings)), as_json=as_json)
 

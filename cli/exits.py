@@ -134,7 +134,7 @@ class Guarded(TyperGroup):
         """Run the command."""
         as_json = "--json" in ctx.args
         try:
-            with ending_in_order():
+            with end_in_order():
                 return super().invoke(ctx)
         except (Exception, KeyboardInterrupt) as caught:
             fault: BaseException = caught
@@ -181,7 +181,7 @@ def _suggest(fault: Any) -> None:
 
 
 @contextmanager
-def ending_in_order() -> Iterator[None]:
+def end_in_order() -> Iterator[None]:
     """Make SIGTERM and the end of the terminal work like Ctrl-C, so that processes end and temporary files are removed."""
     main = threading.current_thread() is threading.main_thread()  # only there can handlers be set
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if main and hasattr(signal, name)]

@@ -21,7 +21,7 @@ class MissingExtra(Exception):
 
 def missing_modules() -> list[str]:
     """Return the modules of the extra `server` that are not installed."""
-    return [name for name in SERVER_MODULES if not _installed(name)]
+    return [name for name in SERVER_MODULES if not _is_installed(name)]
 
 
 def require_server(command: str) -> None:
@@ -36,7 +36,7 @@ def require_server(command: str) -> None:
         raise MissingExtra(command)
 
 
-def _installed(name: str) -> bool:
+def _is_installed(name: str) -> bool:
     try:
         return find_spec(name) is not None
     except (ImportError, ValueError):  # ValueError: sys.modules holds None or a module without a spec

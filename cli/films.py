@@ -61,7 +61,7 @@ def inspect_film(film: Path, *, region: Path | None, options: dict[str, Any], as
     InvalidInput
         The film, the region or an option cannot be used.
     """
-    from pliant.cli.show import print_json, shown_interpretation
+    from pliant.cli.show import dump_interpretation, print_json
     from pliant.client.multipart import checked_options
     from pliant.worker.films.sources import FilmSource
     from pliant.worker.films.tracker import read_film
@@ -72,7 +72,7 @@ def inspect_film(film: Path, *, region: Path | None, options: dict[str, Any], as
     facts, warnings = read.facts, warnings_of_check(read.facts, region, checked)
     if as_json:
         film_itself = facts.model_dump(mode="json", exclude={"first_frame"})
-        print_json({**shown_interpretation(read.interpretation), "film": film_itself, "warnings": warnings})
+        print_json({**dump_interpretation(read.interpretation), "film": film_itself, "warnings": warnings})
         return
     from rich.table import Table
     from rich.text import Text

@@ -70,11 +70,11 @@ def submit(
 
     With several files, repeating the command finds the existing jobs by the contents of the files and the options.
     """
-    from pliant.cli.commands.batch import Batch, expanded
+    from pliant.cli.commands.batch import Batch, expand
 
     session: Session = ctx.obj
     session.json = as_json
-    options, chosen, waits = parse_options(option), expanded(files, region), wait or output is not None
+    options, chosen, waits = parse_options(option), expand(files, region), wait or output is not None
     parts = {"mesh": mesh, "ground_truth": ground_truth, "rotations": rotations, "webhook": webhook}
     if chosen != files or len(chosen) > 1:
         check_inputs(None, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=None)
@@ -98,13 +98,13 @@ def submit(
     known = job_id is not None or key is not None  # a named job may be an earlier one, whose files may be here already
     place = nullcontext() if output is None else results_folder(output, force=force or known)
     with place, session.client(url, as_json=as_json) as client:
-        job = _submitted(session, client, given, wait=waits, output=output, force=force)
+        job = _submit(session, client, given, wait=waits, output=output, force=force)
         show_job(job.record, as_json=as_json)
         if not job.status.final and not as_json:
             err().print(f"Follow it with: pliant watch {job.id}", highlight=False)
 
 
-def _submitted(
+def _submit(
     session: Session, client: Client, given: dict[str, Any], *, wait: bool, output: Path | None, force: bool
 ) -> RemoteJob:
     """Submit one job with a progress bar; if requested, wait for it and download its files."""

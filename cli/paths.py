@@ -150,7 +150,7 @@ def output_file(
 
 
 @contextmanager
-def written_aside(path: Path) -> Iterator[Path]:
+def write_aside(path: Path) -> Iterator[Path]:
     """Yield the path of a hidden file to write, and move it to `path` at the end; after an error `path` is unchanged.
 
     Its name is short, whatever the length of the other.
@@ -163,7 +163,7 @@ def written_aside(path: Path) -> Iterator[Path]:
         aside.unlink(missing_ok=True)
 
 
-def made_folder(folder: Path, option: str) -> None:
+def make_folder(folder: Path, option: str) -> None:
     """Create a folder, unless it exists, and check that it is writable.
 
     Raises
@@ -195,7 +195,7 @@ def output_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FI
     """
     from pliant.client.errors import BadArgument
 
-    made_folder(folder, "--output")
+    make_folder(folder, "--output")
     existing = [name for name in files if (folder / name).exists()]
     if existing and not force:
         raise BadArgument(

@@ -70,7 +70,7 @@ def print_json(value: object) -> None:
     print(text)
 
 
-def shown_interpretation(interpretation: Interpretation) -> dict[str, Any]:
+def dump_interpretation(interpretation: Interpretation) -> dict[str, Any]:
     """Return an interpretation for `--json`, without its pictures."""
     shown: dict[str, Any] = interpretation.model_dump(mode="json", exclude={"sample", "first_frame"})
     return shown
@@ -79,7 +79,7 @@ def shown_interpretation(interpretation: Interpretation) -> dict[str, Any]:
 def show_fault(fault: BaseException, sentence: str, code: Exit, *, as_json: bool, url: str | None = None) -> None:
     """Print an error and a reference to its explanation on standard error; `url` is the service that the command used."""
     details = details_of(fault)
-    more = explained_at(details, url)
+    more = find_explanation(details, url)
     if as_json:
         document = {
             "exit_code": int(code),
@@ -99,7 +99,7 @@ def show_fault(fault: BaseException, sentence: str, code: Exit, *, as_json: bool
         screen.print(f"More about this error: {more}")
 
 
-def explained_at(details: Mapping[str, Any], url: str | None) -> str | None:
+def find_explanation(details: Mapping[str, Any], url: str | None) -> str | None:
     """Return the URL or command that explains the code in an error's `details_of`; None without a known code.
 
     Errors of the service at `url` are explained by a page of that service, others by `pliant explain`, which prints the same text.
@@ -136,7 +136,7 @@ def show_job(job: Job, *, as_json: bool) -> None:
     screen = out()
     screen.print(Text.assemble((job.id, "bold"), "  ", (job.status, COLOURS[job.status]), f"  {job.name}"))
     table = Table.grid(padding=(0, 2))
-    for name, value in understood(job.interpretation):
+    for name, value in describe_inputs(job.interpretation):
         table.add_row(Text(name, "dim"), value)
     if job.place_in_queue is not None:
         table.add_row(Text("in the queue", "dim"), "next" if job.place_in_queue == 0 else f"{job.place_in_queue} ahead")
@@ -185,7 +185,7 @@ def _verdict(result: Job | Finished) -> tuple[str, str]:
     return words, colour
 
 
-def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
+def describe_inputs(interpretation: Interpretation) -> list[tuple[str, str]]:
     """Return the interpretation of the inputs as pairs of label and text."""
     if interpretation.mesh_source == "film" and interpretation.num_points == 0:  # not tracked yet
         return [("film", note) for note in interpretation.notes]
@@ -205,11 +205,11 @@ def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
     if len(given) > 0:
         rows.append(("also given", ", ".join(given)))
     if (estimate := interpretation.estimate) is not None:
-        rows.append(("estimate", needs(estimate)))
+        rows.append(("estimate", describe_needs(estimate)))
     return rows + [("note", note) for note in interpretation.notes]
 
 
-def needs(estimate: Estimate) -> str:
+def describe_needs(estimate: Estimate) -> str:
     """Return estimated memory and time in words."""
     return f"about {in_gigabytes(estimate)} of memory, {estimate.seconds:,.0f} s on one core"
 
@@ -273,12 +273,12 @@ def show_options(schema: Mapping[str, Any], *, as_json: bool) -> None:
     table.add_column("meaning", overflow="fold")
     for name, entry in schema["properties"].items():
         meaning = Text(entry.get("description", ""))
-        meaning.append(f"\n{allowed(entry)}", "dim")
+        meaning.append(f"\n{describe_values(entry)}", "dim")
         table.add_row(name, json.dumps(entry.get("default")), meaning)
     out().print(table, soft_wrap=False)
 
 
-def allowed(entry: Mapping[str, Any]) -> str:
+def describe_values(entry: Mapping[str, Any]) -> str:
     """Describe the values that an option accepts."""
     forms = []
     for variant in entry.get("anyOf", [entry]):

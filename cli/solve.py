@@ -25,12 +25,12 @@ from pliant.cli.session import (
     parse_options,
 )
 from pliant.cli.show import (
+    describe_inputs,
+    dump_interpretation,
     metrics_table,
     out,
     print_json,
     show_warnings,
-    shown_interpretation,
-    understood,
     verdict_lines,
 )
 
@@ -121,7 +121,7 @@ def solve_tracks(
     inputs = read_inputs(**parts, options=checked)
     checked = tracks_options(checked, inputs.interpretation)
     if not as_json:
-        show_understood(inputs.interpretation)
+        show_inputs(inputs.interpretation)
     with progress_bar(line_every=LINE_EVERY) as bar, threads_limited(threads):
         return reconstruct(inputs, checked, output, name=name, on_progress=bar.on_step)
 
@@ -162,9 +162,9 @@ def inspect(
                 ground_truth=ground_truth, rotations=rotations, options=options,
             )  # fmt: skip
     if as_json:
-        print_json(shown_interpretation(interpretation))
+        print_json(dump_interpretation(interpretation))
     else:
-        show_understood(interpretation)
+        show_inputs(interpretation)
 
 
 def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:
@@ -197,12 +197,12 @@ def file_or_word(mesh: str | None) -> Path | str | None:
     return Path(mesh) if mesh is not None and Path(mesh).is_file() else mesh
 
 
-def show_understood(interpretation: Interpretation) -> None:
+def show_inputs(interpretation: Interpretation) -> None:
     """Print the interpretation of the inputs."""
     from rich.table import Table
     from rich.text import Text
 
     table = Table.grid(padding=(0, 2))
-    for name, words in understood(interpretation):
+    for name, words in describe_inputs(interpretation):
         table.add_row(Text(name, "dim"), Text(words))
     out().print(table)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from pliant.cli.paths import input_file, output_file, written_aside
+from pliant.cli.paths import input_file, output_file, write_aside
 from pliant.cli.session import LINE_EVERY, Force, Json, one_numerical_thread
 from pliant.cli.show import err, out, print_json, show_warnings
 
@@ -75,10 +75,10 @@ def track(
             film, region=region, region_frame=region_frame, template_frame=template_frame, frames=frames,
             grid_step=grid_step, on_step=on_step, on_warnings=on_warnings,
         )  # fmt: skip
-    with written_aside(output) as aside:
+    with write_aside(output) as aside:
         tracked.save_npz(aside)
     if preview is not None:
-        with written_aside(preview) as aside:
+        with write_aside(preview) as aside:
             aside.write_bytes(tracked.contact_sheet())
     if as_json:
         _print_json(tracked, output, preview)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from pliant.cli.extras import require_server
-from pliant.cli.paths import made_folder
+from pliant.cli.paths import make_folder
 from pliant.cli.session import Json
 from pliant.cli.show import err, out, print_json
 
@@ -79,11 +79,11 @@ def up(
     from pliant.worker.processes.supervisor import Supervisor, valkey_child, worker_children
     from pliant.worker.processes.valkey import Valkey
 
-    settings, service = chosen(data, workers), ServiceSettings.from_environment()
+    settings, service = read_settings(data, workers), ServiceSettings.from_environment()
     host = service.host if host is None else host
     port = free_port(host, service.port if port is None else port)
     url = address(host, port)
-    made_folder(settings.data, "--data")
+    make_folder(settings.data, "--data")
     with ExitStack() as held:
         children: list[Child] = []
         if settings.redis_url is None:
@@ -117,8 +117,8 @@ def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json
     require_server("pliant work")
     from pliant.worker.processes.supervisor import Supervisor, worker_children
 
-    settings = chosen(data, workers)
-    made_folder(settings.data, "--data")
+    settings = read_settings(data, workers)
+    make_folder(settings.data, "--data")
 
     def announce() -> None:
         if as_json:
@@ -130,7 +130,7 @@ def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json
     Supervisor(worker_children(settings)).run(on_started=announce)
 
 
-def chosen(data: Path | None, workers: int | None) -> Settings:
+def read_settings(data: Path | None, workers: int | None) -> Settings:
     """Return the settings; the command line takes precedence over the environment."""
     from pliant.worker.settings import Settings as WorkerSettings
 

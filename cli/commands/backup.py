@@ -11,7 +11,7 @@ from pliant.cli.extras import require_server
 from pliant.cli.paths import installation
 from pliant.cli.session import Json
 from pliant.cli.show import err, print_json
-from pliant.cli.up import Data, chosen
+from pliant.cli.up import Data, read_settings
 
 if TYPE_CHECKING:
     from pliant.worker.maintenance.backup import Summary
@@ -31,7 +31,7 @@ def backup(
     from pliant.worker.maintenance.backup import write_backup
     from pliant.worker.processes.valkey import attended
 
-    settings = chosen(data, None)
+    settings = read_settings(data, None)
     installation(settings)
     with attended(settings):
         summary = write_backup(settings, target)
@@ -51,7 +51,7 @@ def restore(
     from pliant.worker.processes.valkey import attended
 
     read_manifest(source)  # before a new installation is created for it
-    settings = chosen(data, None)
+    settings = read_settings(data, None)
     with attended(settings):
         summary = restore_backup(settings, source)
     _show("Restored", summary, source, as_json=as_json)

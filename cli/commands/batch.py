@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from pliant.cli.exits import Exit
 from pliant.cli.films import as_one_file, is_film
-from pliant.cli.paths import different_files, made_folder, output_folder, tracks_or_film
+from pliant.cli.paths import different_files, make_folder, output_folder, tracks_or_film
 from pliant.cli.session import LINE_EVERY, Session, name_of
-from pliant.cli.show import COLOURS, VERDICTS, details_of, err, explained_at, out, print_json
+from pliant.cli.show import COLOURS, VERDICTS, details_of, err, find_explanation, out, print_json
 from pliant.schemas.pictures import pictures_in
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ ENDINGS = frozenset({".npz", ".npy", ".mat", ".h5", ".hdf5", ".csv", ".txt"})
 """Extensions of track files in a folder."""
 
 
-def expanded(given: list[Path], region: Path | None) -> list[Path]:
+def expand(given: list[Path], region: Path | None) -> list[Path]:
     """Replace each folder of track files and each pattern by its files, sorted by name; a folder of pictures is a film.
 
     Raises
@@ -71,7 +71,7 @@ def track_files(folder: Path) -> list[Path]:
     return sorted(each for each in folder.iterdir() if each.suffix.lower() in ENDINGS and each.is_file())
 
 
-def judged(job: Job | None) -> Text:
+def describe_verdict(job: Job | None) -> Text:
     """Return a job's verdict with its first reason; empty if it has no verdict."""
     from rich.text import Text
 
@@ -137,10 +137,10 @@ class Batch:
             raise BadArgument(
                 f"--output: several files are named {twice}, and would share a folder. Submit them separately."
             )
-        made_folder(self.output, "--output")
+        make_folder(self.output, "--output")
         for each in names:
             if (self.output / each).exists():  # the others are made for results only
-                made_folder(self.output / each, "--output")
+                make_folder(self.output / each, "--output")
 
     def run(self, client: Client) -> None:
         """Submit all files and, if requested, wait for the jobs.
@@ -247,7 +247,7 @@ class Batch:
             )
             table.add_row(
                 Text(str(row.file)), "" if job is None else job.id, Text(status, COLOURS.get(status, "red")),
-                judged(job), "" if took is None else f"{took.total_seconds():.1f}",
+                describe_verdict(job), "" if took is None else f"{took.total_seconds():.1f}",
             )  # fmt: skip
         out().print(table)
         for row in self.rows:
@@ -256,14 +256,14 @@ class Batch:
 
     def _refusal(self, error: Exception) -> str:
         """Return the message of an error with a reference to its explanation."""
-        more = explained_at(details_of(error), self.url)
+        more = find_explanation(details_of(error), self.url)
         return str(error) if more is None else f"{error} More about this error: {more}"
 
     def _outcome(self, row: Row) -> dict[str, Any]:
         return {
             "job": None if row.job is None else row.job.model_dump(mode="json"),
             "error": None if row.error is None else str(row.error),
-            "explained_at": None if row.error is None else explained_at(details_of(row.error), self.url),
+            "explained_at": None if row.error is None else find_explanation(details_of(row.error), self.url),
         }
 
     def _common(self, secret: str | None) -> str:

@@ -21,7 +21,7 @@ def explain(
     from pliant.schemas.problems import ProblemCode
 
     ctx.obj.json = as_json
-    codes = [found_code(code)] if code else list(ProblemCode)
+    codes = [parse_code(code)] if code else list(ProblemCode)
     if as_json:
         print_json([{"code": each, **_members(each)} for each in codes])
         return
@@ -35,7 +35,7 @@ def explain(
         screen.print(f"{each.cause}\nWhat to do: {each.remedy}")
 
 
-def found_code(text: str) -> ProblemCode:
+def parse_code(text: str) -> ProblemCode:
     """Return the error code with this name.
 
     Raises

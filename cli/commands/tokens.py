@@ -13,7 +13,7 @@ from pliant.cli.extras import require_server
 from pliant.cli.paths import installation
 from pliant.cli.session import Json
 from pliant.cli.show import err, out, print_json
-from pliant.cli.up import Data, chosen
+from pliant.cli.up import Data, read_settings
 
 if TYPE_CHECKING:
     from pliant.worker.tokens import Token, Tokens
@@ -90,7 +90,7 @@ def create(
         err().print(f"Token {token.id} for {token.name} {state}.")
         return
     if as_json:
-        print_json({**shown(token), "token": text})
+        print_json({**dump_token(token), "token": text})
     else:
         _show_once(token, text)
 
@@ -111,7 +111,7 @@ def list_tokens(ctx: typer.Context, data: Data = None, as_json: Json = False) ->
     with store(data) as tokens:
         found = tokens.all()
     if as_json:
-        print_json([shown(token) for token in found])
+        print_json([dump_token(token) for token in found])
         return
     out().print(table_of(found))
 
@@ -149,12 +149,12 @@ def revoke(ctx: typer.Context, id: TokenId, data: Data = None, as_json: Json = F
     with store(data) as tokens:
         token = tokens.revoke(id)
     if as_json:
-        print_json(shown(token))
+        print_json(dump_token(token))
     else:
         err().print(f"Token {token.id} ({token.name}) is revoked.")
 
 
-def shown(token: Token) -> dict[str, Any]:
+def dump_token(token: Token) -> dict[str, Any]:
     """Return a token's record without its hash, for JSON output."""
     return token.model_dump(
         mode="json", exclude={"sha256"} if token.revoked else {"sha256", "revoked"}, exclude_none=True
@@ -193,7 +193,7 @@ def store(data: Path | None, *, new: bool = False) -> Iterator[Tokens]:
     from pliant.worker.processes.valkey import attended
     from pliant.worker.tokens import Tokens
 
-    settings = chosen(data, None)
+    settings = read_settings(data, None)
     if not new:
         installation(settings)
     with attended(settings):

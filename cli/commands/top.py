@@ -42,21 +42,21 @@ def top(
     ctx.obj.json = as_json
     with ctx.obj.client(url, as_json=as_json) as client:
         if as_json:
-            view = looked(client)
+            view = read_view(client)
             print_json({**asdict(view), "jobs": [job.model_dump(mode="json") for job in view.jobs]})
             return
         if once:
-            out().print(drawn(looked(client)))
+            out().print(draw(read_view(client)))
             return
         from rich.live import Live
 
-        with Live(drawn(looked(client)), console=out(), screen=True, auto_refresh=False) as live:
+        with Live(draw(read_view(client)), console=out(), screen=True, auto_refresh=False) as live:
             while True:
                 time.sleep(every)
-                live.update(drawn(looked(client)), refresh=True)
+                live.update(draw(read_view(client)), refresh=True)
 
 
-def looked(client: Client) -> View:
+def read_view(client: Client) -> View:
     """Query the service."""
     from itertools import islice
 
@@ -75,7 +75,7 @@ def looked(client: Client) -> View:
     return View(parts, len(running), len(queued), tuple(shown))
 
 
-def drawn(view: View) -> Table:
+def draw(view: View) -> Table:
     """Return the snapshot as a table."""
     from rich.table import Table
     from rich.text import Text

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from browsing import Browsing, why_not
 from long_jobs import long_request
-from pliant.cli.demo import announced
+from pliant.cli.demo import read_address
 from pliant.cli.exits import Exit
 from pliant.client import AsyncClient, Client, NotAuthorized, NotFound
 from pliant.client.webhooks import new_secret, verified
@@ -72,7 +72,7 @@ def url(data: Path, first: dict[str, Any], tmp_path_factory: pytest.TempPathFact
         env = CLEAN | {"PLIANT_WEBHOOK_NETWORKS": "127.0.0.0/8"}
         up = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, env=env, text=True)
     assert up.stdout is not None
-    address = announced(up.stdout)
+    address = read_address(up.stdout)
     assert address is not None, log.read_text()
     yield address
     up.send_signal(signal.SIGTERM)

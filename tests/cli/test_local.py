@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 import redis
 from pliant.cli import app
-from pliant.cli.demo import GOOD, announced, judge, why
+from pliant.cli.demo import GOOD, judge, read_address, why
 from pliant.cli.session import Session, name_of, parse_options
 from pliant.cli.solve import file_or_word
 from pliant.client import BadArgument, Unreachable
@@ -85,8 +85,8 @@ def test_the_address_is_reachable_from_this_machine(host: str, url: str) -> None
 def test_the_command_line_takes_precedence_over_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PLIANT_WORKERS", "3")
     monkeypatch.setenv("PLIANT_DATA", "there")
-    assert (up.chosen(None, None).workers, up.chosen(None, None).data) == (3, Path("there"))
-    assert (up.chosen(Path("here"), 5).workers, up.chosen(Path("here"), 5).data) == (5, Path("here"))
+    assert (up.read_settings(None, None).workers, up.read_settings(None, None).data) == (3, Path("there"))
+    assert (up.read_settings(Path("here"), 5).workers, up.read_settings(Path("here"), 5).data) == (5, Path("here"))
 
 
 def test_the_service_logs_warnings_unless_a_level_is_configured(
@@ -170,8 +170,8 @@ def test_the_demonstration_succeeds_only_if_all_errors_are_small() -> None:
 
 
 def test_the_address_is_read_from_the_output_of_up() -> None:
-    assert announced(io.StringIO('{\n  "url": "http://x",\n  "data": "d"\n}\n')) == "http://x"
-    assert announced(io.StringIO("")) is None
+    assert read_address(io.StringIO('{\n  "url": "http://x",\n  "data": "d"\n}\n')) == "http://x"
+    assert read_address(io.StringIO("")) is None
 
 
 def test_a_service_that_does_not_start_gives_its_message_or_its_last_lines() -> None:

@@ -19,7 +19,7 @@ from pliant.cli import app
 from pliant.cli.exits import Exit, code_of, sentence_of
 from pliant.cli.paths import output_file, output_folder
 from pliant.cli.session import Session
-from pliant.cli.show import details_of, explained_at
+from pliant.cli.show import details_of, find_explanation
 from pliant.client import BadArgument
 from pliant.schemas.problems import ProblemCode
 from pliant.service.testing import InMemoryService
@@ -546,8 +546,8 @@ def test_errors_end_with_where_they_are_explained(run: Run, tracks: Path, tmp_pa
     document = json.loads(run("submit", tmp_path / "short.npz", "--json").stderr)
     assert document["explained_at"] == "http://127.0.0.1:8000/errors/too_few_frames"
     full = OSError(28, "No space left on device")
-    assert explained_at(details_of(full), None) == "pliant explain unusable_path"
-    assert explained_at(details_of(KeyboardInterrupt()), None) is None, "no refusal"
+    assert find_explanation(details_of(full), None) == "pliant explain unusable_path"
+    assert find_explanation(details_of(KeyboardInterrupt()), None) is None, "no refusal"
     ran = run("solve", tracks, "--mask", "m.png")
     assert (ran.exit_code, "No such option: --mask (Possible options: --region)" in words(ran)) == (Exit.USAGE, True)
     ran = run("solve", tracks, "--image-size", "320x240")

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 from pliant.cli import app
-from pliant.cli.commands.top import drawn, looked
+from pliant.cli.commands.top import draw, read_view
 from pliant.cli.session import Session
 from pliant.client import Client
 from pliant.service.testing import InMemoryService
@@ -30,10 +30,10 @@ def test_running_and_queued_jobs_come_first(service: InMemoryService) -> None:
         service.worker.steps = math.inf
         for name in ("first", "second", "third"):
             client.submit(tracks, mesh="none", name=name)
-        view = looked(client)
+        view = read_view(client)
         assert (view.running + view.queued, [job.name for job in view.jobs][-1]) == (3, "done")
         console = Console(width=160, record=True)
-        console.print(drawn(view))
+        console.print(draw(view))
         text = console.export_text()
         assert f"{view.running} running, {view.queued} queued" in text
         assert "redis ok" in text

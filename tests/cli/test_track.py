@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from pliant.cli import app
-from pliant.cli.paths import written_aside
+from pliant.cli.paths import write_aside
 from pliant.tracking import FilmError
 from pliant.tracking.records import TrackingStep
 from typer.testing import CliRunner, Result
@@ -146,7 +146,7 @@ def test_names_that_do_not_fit_the_files_are_refused_before_tracking(
 
 
 def test_a_file_may_have_the_longest_name(tmp_path: Path) -> None:
-    with written_aside(tmp_path / ("x" * 251 + ".npz")) as aside:
+    with write_aside(tmp_path / ("x" * 251 + ".npz")) as aside:
         aside.write_text("content")
         assert aside.parent == tmp_path
     assert [each.name for each in tmp_path.iterdir()] == ["x" * 251 + ".npz"]

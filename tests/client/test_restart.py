@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pliant.cli.demo import announced
+from pliant.cli.demo import read_address
 from pliant.client import Client, Job, Retry, Status
 from pliant.solver.gallery import face
 
@@ -42,7 +42,7 @@ class Installation:
                     stdout=subprocess.PIPE, stderr=log, text=True,
                 )  # fmt: skip
             assert self.process.stdout is not None
-            url = announced(self.process.stdout)
+            url = read_address(self.process.stdout)
             if url is not None:
                 return url
             self.end()
