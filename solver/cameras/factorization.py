@@ -17,10 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.model.lbfgs import minimize
 from pliant.solver.model.so3 import from_rows, start_at_identity
-from pliant.solver.pulse import pulse
+from pliant.solver.pulse import never, pulse
 from pliant.solver.records import Floats
-from scipy.optimize import minimize
 
 Upper = tuple[NDArray[np.intp], NDArray[np.intp]]
 
@@ -134,10 +134,10 @@ def _unfold(coordinates: Floats, upper: Upper, stretch: Floats, size: int) -> Fl
 
 def refine_factor(factor: Floats, start: Floats) -> Floats:
     """Return the G that minimises the scale-free deviation from orthonormality, by L-BFGS from `start`."""
-    found = minimize(
-        _orthonormality, start.ravel(), args=(factor,), jac=True, method="L-BFGS-B", options={"maxiter": 500}
+    flat, _ = minimize(
+        lambda flat: _orthonormality(flat, factor), start.ravel(), maxiter=500, maxcor=10, should_stop=never
     )
-    return np.asarray(found.x).reshape(start.shape)
+    return flat.reshape(start.shape)
 
 
 def _orthonormality(flat: Floats, factor: Floats) -> tuple[float, Floats]:

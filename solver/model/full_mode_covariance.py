@@ -24,12 +24,12 @@ from dataclasses import dataclass
 import numpy as np
 from pliant.solver.model.camera_motion_prior import rotation_roughness, scale_roughness
 from pliant.solver.model.image_density import ImageModel, terms
+from pliant.solver.model.lbfgs import minimize
 from pliant.solver.model.marginal_likelihood import UNLIKELY, Scene, cameras_and_jacobian, cameras_of, root_matrix
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import vee
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, projections_of
-from scipy.optimize import minimize
 
 POINTS_PER_COEFFICIENT = 4
 """Minimum number of points for each of the 3K coefficients."""
@@ -162,13 +162,8 @@ def refined(
         value, gradient = energy(scene, covariance.axis_covariance, Basis.unflat(flat, frames, size))
         return value, gradient.flat()
 
-    def stop_check(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
-        if should_stop():
-            raise StopIteration
-
     steps = min(MAX_STEPS, MAX_FRAME_STEPS // frames)
-    found = minimize(
-        objective, start.flat(), jac=True, method="L-BFGS-B", callback=stop_check,
-        options={"maxiter": steps, "maxfun": 2 * steps, "maxcor": 20, "ftol": LBFGS_TOLERANCE},
-    )  # fmt: skip
-    return cameras_of(scene, Basis.unflat(np.asarray(found.x), frames, size))
+    flat, _ = minimize(
+        objective, start.flat(), maxiter=steps, maxfun=2 * steps, ftol=LBFGS_TOLERANCE, should_stop=should_stop
+    )
+    return cameras_of(scene, Basis.unflat(flat, frames, size))

@@ -27,10 +27,10 @@ import numpy as np
 from pliant.solver.model.camera_motion_prior import STEADY, rotation_roughness, scale_roughness
 from pliant.solver.model.frame_metric import FrameMetric
 from pliant.solver.model.image_density import ImageModel, Terms, factor_of, inverted, terms
+from pliant.solver.model.lbfgs import minimize
 from pliant.solver.model.so3 import exponential_and_jacobian, vee
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, projections_of
-from scipy.optimize import minimize
 
 NOISE_STD_FLOOR = 3e-3
 """Floor of the noise standard deviation, normalized units: no tracks of real video are better. A smaller floor spends
@@ -297,15 +297,8 @@ def fit(
         slope = gradient.flat() if metric is None else _over_frames(metric.gradient, gradient.flat(), frames)
         return factor * value, factor * slope[held:]
 
-    def stop_check(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
-        if should_stop():
-            raise StopIteration
-
-    found = minimize(
-        objective, given[held:], jac=True, method="L-BFGS-B", callback=stop_check,
-        options={"maxiter": iterations, "maxcor": 20},
-    )  # fmt: skip
-    return parameters(np.asarray(found.x)), float(found.fun) / factor
+    free, value = minimize(objective, given[held:], maxiter=iterations, should_stop=should_stop)
+    return parameters(free), value / factor
 
 
 def metric_of(scene: Scene, motion: Motion) -> FrameMetric:

@@ -32,13 +32,14 @@ from pliant.solver.cameras.perspective import (
     depths_of,
 )
 from pliant.solver.model.image_density import factor_of
+from pliant.solver.model.lbfgs import minimize
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, UNLIKELY, Motion, energy_with_inverse
 from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
+from pliant.solver.pulse import never
 from pliant.solver.records import Floats
 from pliant.solver.refinement.learned import Learned, Refinement, motion_of, moved_to, scene_at, to_all_frames
 from pliant.solver.tracks.frame_selection import evenly_spread
 from pliant.solver.tracks.matrix import centred, columns
-from scipy.optimize import minimize
 
 CURVATURES = (0.02, 0.035, 0.06, 0.1, 0.16, 0.25, 0.38)
 """Values of κ compared, in inverse RMS radii of the tracks, each with both signs. At .02 the correction is 1 % to 2 % of a position; at
@@ -338,11 +339,9 @@ def refine_with_focal(
         gradient[-1] *= free
         return value, gradient[held:]
 
-    result = minimize(
-        objective, given[held:], jac=True, method="L-BFGS-B", options={"maxiter": iterations, "maxcor": 20}
-    )
-    flat = np.concatenate([given[:held], np.asarray(result.x)])
-    moved = moved_to(energy.scene, start, Motion.unflat(flat[:-1], len(views)), float(result.fun))
+    moving, value = minimize(objective, given[held:], maxiter=iterations, should_stop=never)
+    flat = np.concatenate([given[:held], moving])
+    moved = moved_to(energy.scene, start, Motion.unflat(flat[:-1], len(views)), value)
     turns = towards(views.mean(axis=1), float(flat[-1]))
     rotations = turns.transpose(0, 2, 1) @ moved.rotations if turning else found.rotations
     return replace(moved, rotations=rotations), float(flat[-1])
