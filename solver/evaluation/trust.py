@@ -15,7 +15,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.pulse import pulse
-from pliant.solver.records import Floats
+from pliant.solver.records import Camera, Floats
+from pliant.solver.solution import Solution
 
 INTERVAL = (0.35, 3.6)
 """Ends of the interval for the error, relative to the expected error: about the 10 and 90 % quantiles of true over expected error on the
@@ -124,38 +125,25 @@ class Trust:
 
 
 def assess(
-    shapes: Floats,
-    rotations: Floats,
-    residuals: Floats,
+    solution: Solution,
     visible: Floats,
     *,
-    scales: Floats,
-    shapes_std: Floats | None,
-    held_out_error: float | None = None,
-    ordered: bool = True,
-    planar: bool = False,
-    modes: int = 0,
-    depth_is_typical: bool = False,
-    shown: NDArray[np.bool_] | None = None,
-    behind: NDArray[np.bool_] | None = None,
-    unclear_camera: str | None = None,
+    held_out_error: float | None,
+    ordered: bool,
+    planar: bool,
+    modes: int,
+    depth_is_typical: bool,
+    shown: NDArray[np.bool_],
+    unclear_camera: str | None,
 ) -> Trust:
-    """Return the verdict on a result.
+    """Return the verdict on a solution.
 
     Parameters
     ----------
-    shapes : ndarray, shape (F, P, 3)
-        The tracks' unit.
-    rotations : ndarray, shape (F, 3, 3)
-        Camera from world.
-    residuals : ndarray, shape (F, P)
-        Distances of the observations from the projected shapes, the tracks' unit.
+    solution : Solution
+        With standard deviations, unless its prior has no posterior.
     visible : ndarray, shape (F, P)
         Confidence of the observations used; 0 where hidden or rejected.
-    scales : ndarray, shape (F,)
-        Image units per unit of the shapes.
-    shapes_std : ndarray, shape (F, P), or None
-        Standard deviations of the positions, the unit of the shapes.
     held_out_error : float or None
         Median distance of held-out observations from their prediction, relative to the size.
     ordered : bool
@@ -166,18 +154,17 @@ def assess(
         Number of modes of deformation of the prior that exceed the noise.
     depth_is_typical : bool
         Whether a prior, not the tracks, determines the extent of depth.
-    shown : ndarray of bool, shape (F,), optional
-        Frames that show enough points for a camera of their own; None for all.
-    behind : ndarray of bool, shape (F,), optional
-        Frames in which points lie behind the camera; None for none.
-    unclear_camera : str, optional
+    shown : ndarray of bool, shape (F,)
+        Frames that show enough points for a camera of their own.
+    unclear_camera : str or None
         Sentence that states why the camera model is in doubt; None if it is not.
     """
-    size, shown = size_of(shapes), np.ones(len(shapes), dtype=bool) if shown is None else shown
+    shapes, rotations, shapes_std = solution.shapes, solution.camera.rotations, solution.shapes_std
+    size = size_of(shapes)
     pulse()
     expected = None if shapes_std is None else float(np.sqrt(np.square(shapes_std).mean())) / size
     bounded = not (planar or depth_is_typical)
-    residual, hidden = _fit(residuals, visible, scales, size)
+    residual, hidden = _fit(solution, visible, size)
     turn = turned(rotations[shown])
     turning, deforming = per_frame(shapes, rotations) if ordered else (None, None)
     found = [
@@ -188,7 +175,7 @@ def assess(
             -STILL,
             f"The estimated cameras turn by only {turn:.0f}°; depth needs {NARROW:.0f}° or more.",
         ),
-        *_frame_signs(shown, behind, ordered=ordered),
+        *_frame_signs(shown, frames_behind(solution.camera, shapes), ordered=ordered),
         *_error_signs(expected, held_out_error, bounded=bounded),
         *_motion_signs(turning, deforming),
         *_model_signs(
@@ -204,37 +191,35 @@ def assess(
     )  # fmt: skip
 
 
-def assess_isometric(
-    shapes: Floats,
-    rotations: Floats,
-    residuals: Floats,
-    visible: Floats,
-    *,
-    scales: Floats,
-    ordered: bool,
-    warnings: tuple[str, ...],
-) -> Trust:
-    """Return the verdict on an isometric surface; the arrays are as for `assess`.
+def assess_isometric(solution: Solution, *, ordered: bool) -> Trust:
+    """Return the verdict on the solution of an isometric surface, whose weights are those of the observations used.
 
     Constant edge lengths, not the turn of the camera, determine its depth. There is no expected error, because isometry is not a
-    Gaussian model. `warnings` are the sentences of its search, each of which is a reason for `with_care`.
+    Gaussian model. Each warning of the solution is a reason for `with_care`.
     """
-    residual, hidden = _fit(residuals, visible, scales, size_of(shapes))
+    shapes, rotations = solution.shapes, solution.camera.rotations
+    residual, hidden = _fit(solution, solution.weights, size_of(shapes))
     turning, deforming = per_frame(shapes, rotations) if ordered else (None, None)
-    verdict, reasons = _most_serious_first(
-        [*((Verdict.WITH_CARE, warning) for warning in warnings), *_observation_signs(residual, hidden)]
-    )
+    warned = [(Verdict.WITH_CARE, warning) for warning in solution.choices.warnings]
+    verdict, reasons = _most_serious_first([*warned, *_observation_signs(residual, hidden)])
     return Trust(
         verdict, reasons, None, None, turned(rotations), residual, hidden,
         degrees_per_frame=turning, deformation_per_frame=deforming, depth_from_lengths=True,
     )  # fmt: skip
 
 
-def _fit(residuals: Floats, visible: Floats, scales: Floats, size: float) -> tuple[float, float]:
+def frames_behind(camera: Camera, shapes: Floats) -> NDArray[np.bool_]:
+    """Return a mask of the frames in which points lie behind a perspective camera, shape `(F,)`."""
+    if camera.focal is None:
+        return np.zeros(len(shapes), dtype=bool)
+    return np.asarray(camera.depths(shapes).min(axis=1) <= -camera.focal)
+
+
+def _fit(solution: Solution, visible: Floats, size: float) -> tuple[float, float]:
     """Return the median residual of the observations used, relative to the size, and the share of positions without one."""
     used = visible > 0
     pulse()
-    relative = (residuals / scales[:, None])[used]
+    relative = (solution.residuals / solution.camera.scales[:, None])[used]
     pulse()
     return float(np.median(relative)) / size if relative.size else np.inf, 1.0 - float(used.mean())
 
@@ -249,10 +234,10 @@ def _observation_signs(residual: float, hidden: float) -> list[Sign]:
     ]  # fmt: skip
 
 
-def _frame_signs(shown: NDArray[np.bool_], behind: NDArray[np.bool_] | None, *, ordered: bool) -> list[Sign]:
+def _frame_signs(shown: NDArray[np.bool_], behind: NDArray[np.bool_], *, ordered: bool) -> list[Sign]:
     """Return the reasons in single frames: points behind the camera, and hardly a point visible."""
     found = []
-    if behind is not None and behind.any():
+    if behind.any():
         which = _frames(behind, ordered=ordered)
         found.append((Verdict.DO_NOT_USE, f"In {which}, points of the shape lie behind the camera."))
     if not shown.all():

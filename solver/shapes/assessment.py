@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.cameras.planar_ambiguity import is_planar, on_one_line
@@ -13,7 +12,7 @@ from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.evaluation.trust import Trust, assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.pulse import ShouldStop, never, pulse
-from pliant.solver.records import Camera, Floats, Tracks
+from pliant.solver.records import Floats, Tracks
 from pliant.solver.refinement.focal_length import more_probable, unclear_perspective
 from pliant.solver.shapes.held_out import held_out_error
 from pliant.solver.shapes.jackknife import Changes, learning_changes
@@ -143,19 +142,14 @@ def judged(
 ) -> Trust:
     """Return the verdict on a solution with standard deviations; arguments as for `assessed`."""
     return assess(
-        solution.shapes,
-        solution.camera.rotations,
-        solution.residuals,
+        solution,
         confidence,
-        scales=solution.camera.scales,
-        shapes_std=solution.shapes_std,
         held_out_error=held_out_error,
         ordered=estimate.ordered,
         planar=is_planar(estimate.gram) or on_one_line(tracks),
         modes=0 if covariance is None else covariance.num_deforming(),
         depth_is_typical=estimate.depth_is_typical,
         shown=informative_frames(confidence),
-        behind=frames_behind(solution.camera, solution.shapes),
         unclear_camera=_unclear_camera(estimate.perspective, unit),
     )
 
@@ -179,10 +173,3 @@ def _unclear_camera(view: Perspective | None, unit: float) -> str | None:
         "Whether the tracks show perspective is unclear: it explains them slightly better than orthography, most of all with a focal "
         f"length of about {unit / abs(found):.4g}. Give the focal length, or compare with camera=perspective."
     )
-
-
-def frames_behind(camera: Camera, shapes: Floats) -> NDArray[np.bool_]:
-    """Return a mask of the frames in which points lie behind a perspective camera, shape `(F,)`."""
-    if camera.focal is None:
-        return np.zeros(len(shapes), dtype=bool)
-    return np.asarray(camera.depths(shapes).min(axis=1) <= -camera.focal)

@@ -59,13 +59,9 @@ def isometric_solution(
     median = float(np.median(residual[seen]))
     trace = Trace(np.array([surface.inconsistency]), np.array([median]), np.zeros(1, dtype=np.int32))
     choices = _choices(verdict, surface, unit, float(surface.outliers.sum() / seen.sum()))
-    return Solution(
-        shapes, camera, residual, weights, trace, Outcome.STOPPED if stopped else Outcome.CONVERGED, choices, seconds,
-        trust=assess_isometric(
-            shapes, camera.rotations, residual, weights, scales=camera.scales, ordered=settings.order == "film",
-            warnings=choices.warnings,
-        ),
-    )  # fmt: skip
+    outcome = Outcome.STOPPED if stopped else Outcome.CONVERGED
+    solution = Solution(shapes, camera, residual, weights, trace, outcome, choices, seconds)
+    return replace(solution, trust=assess_isometric(solution, ordered=settings.order == "film"))
 
 
 def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera]:

@@ -7,13 +7,51 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pliant.solver import Camera, KnownCamera, Settings, Tracks, gallery, solve
+from pliant.solver import (
+    Camera,
+    Choices,
+    KnownCamera,
+    Outcome,
+    Settings,
+    Solution,
+    Trace,
+    Tracks,
+    gallery,
+    solve,
+)
 from pliant.solver.evaluation.metrics import e3d_frame
-from pliant.solver.evaluation.trust import Trust, Verdict, assess, assess_isometric, per_frame, size_of, turned
-from pliant.solver.shapes.assessment import frames_behind
+from pliant.solver.evaluation.trust import (
+    Trust,
+    Verdict,
+    assess,
+    assess_isometric,
+    frames_behind,
+    per_frame,
+    size_of,
+    turned,
+)
 from scipy.spatial.transform import Rotation
 
 FRAMES, POINTS = 12, 30
+
+
+CLOSE = {"focal": 100.0, "scales": np.where(np.arange(FRAMES) > 9, 1e3, 1.0)}
+"""A camera that is too close to the object in the last two frames."""
+
+CHOICES = Choices(
+    basis_size=1, temporal_weight=1.0, spatial_weight=0.0, robust_scale=0.01, temporal_order=1, low_rank_weight=0.0, laplacian="none",
+    unit=1.0, noise=0.01,
+)  # fmt: skip
+
+
+def solution_of(shapes: np.ndarray, rotations: np.ndarray, residuals: np.ndarray, **more: Any) -> Solution:
+    none, scales, focal = np.zeros(0), more.pop("scales", np.ones(len(shapes))), more.pop("focal", None)
+    camera = Camera(rotations, scales, np.zeros((len(shapes), 2)), focal=focal)
+    given = {"weights": np.ones(residuals.shape), "choices": CHOICES, **more}
+    return Solution(
+        shapes=shapes, camera=camera, residuals=residuals, trace=Trace(none, none, none.astype(np.int32)),
+        outcome=Outcome.CONVERGED, seconds={}, **given,
+    )  # fmt: skip
 
 
 def judged(**changed: Any) -> Any:
@@ -21,13 +59,16 @@ def judged(**changed: Any) -> Any:
     shapes = rng.normal(size=(POINTS, 3)) + changed.pop("bending", 0.001) * rng.normal(size=(FRAMES, POINTS, 3))
     turn = changed.pop("turn", 60.0)
     rotations = Rotation.from_euler("y", np.linspace(0, turn, FRAMES)[:, None], degrees=True).as_matrix()
+    residuals = changed.pop("residuals", np.full((FRAMES, POINTS), 0.001))
+    std = changed.pop("shapes_std", np.full((FRAMES, POINTS), 0.02))
+    camera = {name: changed.pop(name) for name in ("scales", "focal") if name in changed}
+    solution = solution_of(shapes, rotations, residuals, shapes_std=std, **camera)
+    visible = changed.pop("visible", np.ones((FRAMES, POINTS)))
     given: dict[str, Any] = {
-        "residuals": np.full((FRAMES, POINTS), 0.001),
-        "visible": np.ones((FRAMES, POINTS)),
-        "scales": np.ones(FRAMES),
-        "shapes_std": np.full((FRAMES, POINTS), 0.02),
-    }
-    return assess(shapes, rotations, **{**given, **changed})
+        "held_out_error": None, "ordered": True, "planar": False, "modes": 0, "depth_is_typical": False,
+        "shown": np.ones(FRAMES, dtype=bool), "unclear_camera": None,
+    }  # fmt: skip
+    return assess(solution, visible, **{**given, **changed})
 
 
 def test_frames_that_show_nothing_do_not_count_as_turn() -> None:
@@ -39,9 +80,8 @@ def test_an_isometric_surface_needs_no_turn_but_must_be_seen_and_explain_the_tra
     still, near, seen = np.tile(np.eye(3), (FRAMES, 1, 1)), np.full((FRAMES, POINTS), 0.001), np.ones((FRAMES, POINTS))
 
     def isometric(residuals: Any = near, visible: Any = seen, warnings: tuple[str, ...] = ()) -> Trust:
-        return assess_isometric(
-            shapes, still, residuals, visible, scales=np.ones(FRAMES), ordered=False, warnings=warnings
-        )
+        choices = replace(CHOICES, warnings=warnings)
+        return assess_isometric(solution_of(shapes, still, residuals, weights=visible, choices=choices), ordered=False)
 
     good = isometric()
     assert (good.verdict, good.reasons) == (Verdict.GOOD, ())
@@ -94,7 +134,7 @@ def test_a_result_without_reasons_against_it_is_good() -> None:
         ),
         ({"visible": np.eye(FRAMES, POINTS) + np.eye(FRAMES, POINTS, 12)}, Verdict.DO_NOT_USE, "are hidden"),
         (
-            {"behind": np.arange(FRAMES) > 9},
+            CLOSE,
             Verdict.DO_NOT_USE,
             "In 2 of 12 frames (the first is frame 10), points of the shape lie behind the camera.",
         ),
@@ -103,7 +143,7 @@ def test_a_result_without_reasons_against_it_is_good() -> None:
             Verdict.WITH_CARE,
             "Almost no points are visible in 5 of 12 frames (the first is frame 7)",
         ),
-        ({"behind": np.arange(FRAMES) > 9, "ordered": False}, Verdict.DO_NOT_USE, "In 2 of 12 frames, points"),
+        ({**CLOSE, "ordered": False}, Verdict.DO_NOT_USE, "In 2 of 12 frames, points"),
         ({"planar": True}, Verdict.WITH_CARE, "The tracked surface is nearly flat, 45 % of its size off its plane"),
         ({"depth_is_typical": True}, Verdict.WITH_CARE, "A turn of 60° hardly determines"),
         ({"modes": 7}, Verdict.WITH_CARE, "7 modes of deformation in 12 frames"),

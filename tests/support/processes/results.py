@@ -75,8 +75,12 @@ def make_result(
     )  # fmt: skip
     spread = np.linspace(0.5, 2.0, frames * points).reshape(frames, points) if std else None
     turned = Rotation.from_rotvec(np.linspace(0, 0.8, frames)[:, None] * [0, 1, 0]).as_matrix()
-    trust = assess(shapes, turned, solution.residuals, visible, scales=np.ones(frames), shapes_std=spread)
-    solution = replace(solution, shapes_std=spread, trust=trust)
+    solution = replace(solution, shapes_std=spread)
+    trust = assess(
+        replace(solution, camera=replace(solution.camera, rotations=turned)), visible, held_out_error=None, ordered=True, planar=False,
+        modes=0, depth_is_typical=False, shown=np.ones(frames, dtype=bool), unclear_camera=None,
+    )  # fmt: skip
+    solution = replace(solution, trust=trust)
     if texture:
         inputs = replace(inputs, texture=make_texture(rows, columns))
     return inputs, solution, Options(**options)
