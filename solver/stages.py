@@ -155,9 +155,7 @@ def unseen_frames(visible: Floats) -> float:
     return float(longest_gaps(visible).mean())
 
 
-def learning(
-    frames: int, used: int, *, gaussian: bool, known_cameras: bool, known_scales: bool = False
-) -> tuple[Stage, ...]:
+def learning(frames: int, used: int, *, gaussian: bool, known_cameras: bool, known_scales: bool) -> tuple[Stage, ...]:
     """Return the stages of cameras and prior, learned from `used` of the frames; `Monitor.expect` later adds those of hidden entries."""
     names = ["multistart", "model_order", "starts", "perspective", "scales", "refinement", "covariance"]
     if known_cameras:

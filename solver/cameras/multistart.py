@@ -94,7 +94,7 @@ def with_fixed_rotations(
 
 
 def run_multistart(
-    gram: Floats, entries: list[Candidate], *, ordered: bool = True, should_stop: ShouldStop = never
+    gram: Floats, entries: list[Candidate], *, ordered: bool, should_stop: ShouldStop
 ) -> tuple[Candidate, list[Candidate]]:
     """Return the best candidate, refined, and all candidates after the first round.
 
@@ -106,7 +106,7 @@ def run_multistart(
         From `with_fixed_rotations`; at least one.
     ordered : bool
         False omits smooth starts and the penalty on depth, whose closed form is smooth in time.
-    should_stop : callable, optional
+    should_stop : callable
         Called before every refinement and after each of its iterations; once it returns True, the best so far is returned.
     """
 
@@ -134,7 +134,7 @@ def refined(candidate: Candidate, iterations: int, *, should_stop: ShouldStop = 
     return Candidate(candidate.basis_size, candidate.smooth_start, candidate.scene, motion, energy)
 
 
-def smooth_start(gram: Floats, candidate: Candidate, *, should_stop: ShouldStop = never) -> Candidate:
+def smooth_start(gram: Floats, candidate: Candidate, *, should_stop: ShouldStop) -> Candidate:
     """Return a candidate with smooth camera motion near the given one.
 
     The factorization of a body that deforms as fast as it rotates gives jittering cameras near a local minimum of the

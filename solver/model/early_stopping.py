@@ -104,8 +104,8 @@ def schedule(
     projections: Floats,
     model_order: ModelOrder,
     *,
-    seed: int = 0,
-    should_stop: ShouldStop = never,
+    seed: int,
+    should_stop: ShouldStop,
 ) -> Schedule | None:
     """Return the rounds that held-out points favour; None where they favour all rounds. Arguments as for `learn_with_early_stopping`."""
     frames, count = sample.shape[:2]

@@ -184,7 +184,7 @@ def improve(
 
 
 def rounds(
-    covariance: ShapeCovariance, gram: Floats, projections: Floats, *, floors: Floats, max_modes: int = MAX_MODES
+    covariance: ShapeCovariance, gram: Floats, projections: Floats, *, floors: Floats, max_modes: int
 ) -> Iterator[ShapeCovariance]:
     """Yield the covariance after every round of EM, each with its floor of τ.
 

@@ -62,8 +62,8 @@ def shapes_in_blocks(
     monitor: Monitor,
     *,
     seconds: dict[str, float],
-    start: Floats | None = None,
-    scratch: str | Path | None = None,
+    start: Floats | None,
+    scratch: str | Path | None,
 ) -> Solution:
     """Return the solution of all points; `seconds` is the time per stage so far, `start` and `scratch` are as for `solve_shapes`."""
     began, whole = time.perf_counter(), _Whole(tracks, cameras, prior, scratch)

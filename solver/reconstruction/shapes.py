@@ -28,9 +28,7 @@ DEPTH_ROUNDS, DEPTH_SETTLED = 4, 1e-4
 normalized units, below which they end."""
 
 
-def shapes_from(
-    start: Start, monitor: Monitor, *, seconds: dict[str, float], changes: Changes | None = None
-) -> Solution:
+def shapes_from(start: Start, monitor: Monitor, *, seconds: dict[str, float], changes: Changes | None) -> Solution:
     """Return the solution computed from a start; `seconds` is the time per stage so far, `changes` is as for `assessed`."""
     monitor.enter("shapes")
     monitor.report(_step_of("initialise", start.state, start))

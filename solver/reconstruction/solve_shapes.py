@@ -95,7 +95,7 @@ def shapes_of(
     *,
     seconds: dict[str, float],
     start: Floats | None = None,
-    scratch: str | Path | None = None,
+    scratch: str | Path | None,
 ) -> Solution:
     """Return the solution, at once or in blocks of points; `seconds` is the time per stage so far, `start` and `scratch` as above."""
     if needs_blocks(tracks, settings):

@@ -11,7 +11,7 @@ from pliant.solver.model.early_stopping import described, learn_with_early_stopp
 from pliant.solver.model.expectation_maximisation import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import enter
-from pliant.solver.pulse import ShouldStop, never
+from pliant.solver.pulse import ShouldStop
 from pliant.solver.records import Floats
 from pliant.solver.refinement.depth_rounds import with_depth_map
 
@@ -48,7 +48,7 @@ class LearningData:
 
 
 def learn_covariance(
-    estimate: CameraEstimate, data: LearningData, *, seed: int = 0, should_stop: ShouldStop = never
+    estimate: CameraEstimate, data: LearningData, *, seed: int = 0, should_stop: ShouldStop
 ) -> tuple[CameraEstimate, ShapeCovariance]:
     """Return the shape covariance of all frames for fixed cameras, and the estimate with the depths that follow from it.
 
@@ -60,7 +60,7 @@ def learn_covariance(
         From the same call.
     seed : int
         Seed of the split of the points for held-out scores.
-    should_stop : callable, optional
+    should_stop : callable
         Called between rounds of EM; once it returns True, the best covariance so far is returned.
     """
     if data.covariance is not None:

@@ -11,7 +11,7 @@ from pliant.solver.cameras.planar_ambiguity import is_planar, on_one_line
 from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.evaluation.trust import Trust, assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.pulse import ShouldStop, never, pulse
+from pliant.solver.pulse import ShouldStop, pulse
 from pliant.solver.records import Floats, Tracks
 from pliant.solver.refinement.focal_length import more_probable, unclear_perspective
 from pliant.solver.shapes.held_out import held_out_error
@@ -43,10 +43,10 @@ def assessed(
     turning: bool,
     free_scales: bool,
     seed: int,
-    connected: bool = True,
-    changes: Changes | None = None,
-    centred: bool = True,
-    should_stop: ShouldStop = never,
+    connected: bool,
+    changes: Changes | None,
+    centred: bool,
+    should_stop: ShouldStop,
 ) -> Solution:
     """Return the solution with the standard deviations of its positions and the verdict on it.
 
@@ -72,11 +72,11 @@ def assessed(
         Seed of the random choices: visibility patterns, and folds of early stopping.
     connected : bool
         Whether sparsely observed points were placed on a surface with their neighbours; otherwise only the prior places them.
-    changes : Changes, optional
+    changes : Changes or None
         Jackknife result for these cameras and this covariance; None computes it.
     centred : bool
         Whether the shapes contain all points of the object, so that their mean is its centre. Otherwise the centre is the origin.
-    should_stop : callable, optional
+    should_stop : callable
         Called between units of work; once it returns True, the jackknife is skipped.
     """
     std, held_out = None, None

@@ -28,7 +28,7 @@ def isometric_solution(
     *,
     unit: float,
     seconds: dict[str, float],
-    stopped: bool = False,
+    stopped: bool,
 ) -> Solution:
     """Return the solution for an accepted verdict.
 

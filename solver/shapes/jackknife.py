@@ -29,7 +29,7 @@ from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.observation_model import ImageDensity
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import nearest
-from pliant.solver.pulse import ShouldStop, never
+from pliant.solver.pulse import ShouldStop
 from pliant.solver.records import MIN_POINTS, Floats
 from pliant.solver.refinement.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.shapes.uncertainty import distant_paths
@@ -92,7 +92,7 @@ def learning_changes(
     *,
     turning: bool,
     seed: int = 0,
-    should_stop: ShouldStop = never,
+    should_stop: ShouldStop,
 ) -> Changes:
     """Return how far positions change with the points from which cameras and prior are learned.
 
@@ -108,7 +108,7 @@ def learning_changes(
         Whether to refine the cameras too.
     seed : int
         Seed of the folds of early stopping.
-    should_stop : callable, optional
+    should_stop : callable
         Called between refinements; once it returns True, the changes are 0.
     """
     frames, nothing = len(estimate.rotations), Changes(None, np.zeros((0, 3)))

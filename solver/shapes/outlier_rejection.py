@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pliant.solver.limits import LEARNED_FRAMES
 from pliant.solver.model.observation_model import inlier_probabilities
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.pulse import ShouldStop, never
+from pliant.solver.pulse import ShouldStop
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import POINTS_PER_CHUNK, Filling
 from pliant.solver.tracks.normalization import Normalized
@@ -26,7 +26,7 @@ def gross_outliers(
     filling: Filling,
     *,
     share: float,
-    should_stop: ShouldStop = never,
+    should_stop: ShouldStop,
 ) -> NDArray[np.bool_]:
     """Return the observations that are more probably outliers than not, shape `(F, P)`.
 
@@ -44,7 +44,7 @@ def gross_outliers(
         Model of the completed tracks; its outliers initialise the search.
     share : float
         Estimated share of outliers.
-    should_stop : callable, optional
+    should_stop : callable
         Called between chunks; once it returns True, the outliers found so far are returned.
     """
     found = np.zeros(flat.visible.shape, dtype=bool)

@@ -59,7 +59,7 @@ def build_problem(
 
 
 def with_bending(
-    problem: Problem, choices: Choices, state: State, settings: Settings, *, bending: float | None = None
+    problem: Problem, choices: Choices, state: State, settings: Settings, *, bending: float | None
 ) -> tuple[Problem, Choices, State]:
     """Set λ2 if it is automatic and the prior is Gaussian: to `bending`, or from the bending of the current shapes if None."""
     if problem.quadratic is None or problem.laplacian is None or settings.spatial_weight is not None:

@@ -98,7 +98,7 @@ def well_observed(normalized: Normalized, mesh: Mesh | None) -> WellObserved | N
 
 
 def place_the_rest(
-    part: WellObserved, problem: Problem, covariance: ShapeCovariance, state: State, *, spoiled: bool = False
+    part: WellObserved, problem: Problem, covariance: ShapeCovariance, state: State, *, spoiled: bool
 ) -> tuple[Problem, State]:
     """Return the problem without gross outliers and the state of all points; energy and counts are those of `state`.
 

@@ -219,7 +219,7 @@ def ranks(points: Floats) -> NDArray[np.intp]:
 
 def fit_basis(
     points: Floats, weight: Floats, random: np.random.Generator, given: int = 0, *,
-    should_stop: ShouldStop = never,
+    should_stop: ShouldStop,
 ) -> tuple[Floats, Floats, float]:  # fmt: skip
     """Return the basis (F, 2, r) with the translation last, the covariance of its coefficients, and the residual scale.
 
