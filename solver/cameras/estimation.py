@@ -79,7 +79,7 @@ class CameraEstimate:
     hypotheses: tuple[OtherCameras, ...] = ()
     """About equally probable alternatives: unrefined cameras of factorizations, or a planar object with other pose signs."""
 
-    outliers: float = 0.0
+    outlier_share: float = 0.0
     """Share of the visible entries that completion replaced as gross outliers."""
 
     rank: int = 0
@@ -167,7 +167,7 @@ def estimate_cameras(
     reasons = {"basis_size": _why(ran, best, settings), "scales": scale_reason, "rotations": refined}
     return CameraEstimate(
         rotations, scales, completed.translations, best.basis_size, completed.gram, completed.sample,
-        hypotheses, completed.outliers, completed.rank, completed.filling, None, ordered, reasons,
+        hypotheses, completed.outlier_share, completed.rank, completed.filling, None, ordered, reasons,
         candidates=candidates, sampled=completed.sampled,
     )  # fmt: skip
 
@@ -284,7 +284,7 @@ def given_cameras(
         0,
         completed.gram,
         completed.sample,
-        outliers=completed.outliers,
+        outlier_share=completed.outlier_share,
         rank=completed.rank,
         filling=completed.filling,
         sampled=completed.sampled,

@@ -236,7 +236,7 @@ class _Whole:
         values = {name: float(np.median([getattr(each, name) for each in every])) for name in CHOSEN_BY_BLOCK}
         reasons = _merged([each.reasons for each in every])
         if "outliers" in reasons:
-            reasons["outliers"] = outlier_reason(self._rejected, self._seen, self._cameras.outliers)
+            reasons["outliers"] = outlier_reason(self._rejected, self._seen, self._cameras.outlier_share)
         if len({each.temporal_weight for each in every}) > 1:
             reasons["weights"] = f"Medians of {len(every)} blocks of points. The first: {every[0].reasons['weights']}"
         warnings = tuple(dict.fromkeys(warning for each in every for warning in each.warnings))

@@ -46,7 +46,7 @@ class Cameras:
     camera: Camera
     """Rotations, scales, translations and lens. `solve_shapes` re-estimates the translations together with the shapes."""
 
-    outliers: float
+    outlier_share: float
     """Estimated share of gross outliers among the visible observations."""
 
     reasons: dict[str, str]
@@ -123,7 +123,7 @@ def cameras_of(observations: Observations, monitor: Monitor) -> Cameras:
     used = np.flatnonzero(shown)[:: learned_stride(int(shown.sum()))] if long else np.arange(len(shown))
     part = observations.at(used) if long else observations
     estimate = _without_shapes(part, monitor)
-    if settings.gaussian and estimate.outliers > OUTLIER_SHARE and not monitor():
+    if settings.gaussian and estimate.outlier_share > OUTLIER_SHARE and not monitor():
         observations, estimate = _without_outliers(estimate, observations, part, used, monitor)
         part = observations.at(used) if long else observations
     estimate, data = _with_shapes(estimate, part, monitor)
@@ -134,7 +134,7 @@ def cameras_of(observations: Observations, monitor: Monitor) -> Cameras:
     if observations.known is None:
         estimate = replace(estimate, warnings=turn_warnings(estimate.rotations))
     return Cameras(
-        camera_of(estimate, observations), estimate.outliers, estimate.reasons, estimate.warnings, monitor.stopped,
+        camera_of(estimate, observations), estimate.outlier_share, estimate.reasons, estimate.warnings, monitor.stopped,
         estimate, data, observations,
     )  # fmt: skip
 
@@ -161,7 +161,7 @@ def _without_outliers(
     seed = observations.settings.seed
     shown = np.flatnonzero(informative_frames(part.normalized.visible))
     observed = Observed.of(part.normalized, estimate, shown)
-    probability, outliers = cross_fitted(observed, estimate, shown, seed=seed, should_stop=monitor)
+    probability, outlier_share = cross_fitted(observed, estimate, shown, seed=seed, should_stop=monitor)
     found = np.zeros(observations.tracks.visible.shape, dtype=bool)
     found[np.ix_(used[shown], observed.chosen)] = (observed.confidence > 0) & (probability < 0.5)
     if seen_again(np.where(found[used], 0.0, part.normalized.visible)) < MIN_POINTS:
@@ -170,7 +170,7 @@ def _without_outliers(
     if observations.known is None:
         monitor.expect([stage_of("multistart", len(used))], before="model_order")
     again = _without_shapes(inliers.at(used) if len(used) < len(found) else inliers, monitor, estimate.rank)
-    return inliers.with_all(), replace(again, outliers=outliers)
+    return inliers.with_all(), replace(again, outlier_share=outlier_share)
 
 
 def _with_shapes(
@@ -185,7 +185,7 @@ def _with_shapes(
         if estimate.filling is not None:
             monitor.expect([stage_of("observations", len(shown))], before="covariance")
         # The pose signs of a plane are weakly determined; completed outliers are enough to flip them.
-        corrupted_plane = estimate.outliers > OUTLIER_SHARE and is_planar(estimate.gram)
+        corrupted_plane = estimate.outlier_share > OUTLIER_SHARE and is_planar(estimate.gram)
         scaled = observations.turning or (known is not None and observations.known_scales is None)
         scaled = scaled and settings.estimates_scales and not (known is None and corrupted_plane)
         estimate, data = refine_cameras(

@@ -95,7 +95,7 @@ def _with_the_rest(start: Start, state: State) -> tuple[Start, State]:
     confidence[:, part.kept] = start.problem.confidence
     whole = replace(whole, confidence=confidence, moving=start.problem.moving)
     sparse, never = 1 - len(part.kept) / confidence.shape[1], float((confidence == 0).all(axis=0).mean())
-    whole, state = place_the_rest(part, whole, covariance, state, spoiled=start.outliers > OUTLIER_SHARE)
+    whole, state = place_the_rest(part, whole, covariance, state, spoiled=start.outlier_share > OUTLIER_SHARE)
     reason = (
         f"{sparse:.1%} of the points were seen in fewer than {WELL_OBSERVED_SHARE:.0%} of the frames ({never:.1%} in none): "
         "placed on the surface, then moved to their observations."

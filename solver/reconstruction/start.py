@@ -44,7 +44,7 @@ class Start:
     estimate: CameraEstimate
     covariance: ShapeCovariance | None
 
-    outliers: float
+    outlier_share: float
     """Estimated share of gross outliers among the visible observations."""
 
     part: WellObserved | None
@@ -105,7 +105,7 @@ def find_outliers(
     Returns
     -------
     ndarray of bool, shape (F, P)
-        All False if the estimated share of outliers, `cameras.outliers`, is 0.5 % or less.
+        All False if the estimated share of outliers, `cameras.outlier_share`, is 0.5 % or less.
     """
     used = cameras.observations.settings if settings is None else settings
     monitor = monitored(tracks, None, used, on_step, should_stop, only=("shapes",))
@@ -178,7 +178,7 @@ def prepared(
     state = _initial(problem, estimate, settings, should_stop)
     should_stop()
     return Start(
-        observations, mesh, settings, flat, estimate, covariance, cameras.outliers, part,
+        observations, mesh, settings, flat, estimate, covariance, cameras.outlier_share, part,
         *with_bending(problem, choices, state, settings, bending=bending),
     )  # fmt: skip
 
@@ -246,18 +246,18 @@ def without_learned_prior(settings: Settings) -> Settings:
 def _without_outliers(start: Start, monitor: Monitor) -> Start:
     """Return the start without gross outliers, and with a sentence on their share; unchanged without a learned prior or with hardly any."""
     problem, covariance, filling, estimate = start.problem, start.covariance, start.estimate.filling, start.estimate
-    if covariance is None or problem.weights.temporal == 0 or start.outliers <= OUTLIER_SHARE:
+    if covariance is None or problem.weights.temporal == 0 or start.outlier_share <= OUTLIER_SHARE:
         return start
     if filling is not None:
         found = gross_outliers(
             start.flat if start.part is None else start.part.normalized,
             estimate.projections,
-            estimate.translations, covariance, filling, share=start.outliers, should_stop=monitor,
+            estimate.translations, covariance, filling, share=start.outlier_share, should_stop=monitor,
         )  # fmt: skip
         without = replace(problem, confidence=np.where(found, 0, problem.confidence).astype(problem.confidence.dtype))
         start = replace(start, problem=without, state=init(without, start.state.shapes, start.state.translations))
     seen = int(np.count_nonzero(start.observations.tracks.visible))
-    reason = outlier_reason(seen - int(np.count_nonzero(start.confidence())), seen, start.outliers)
+    reason = outlier_reason(seen - int(np.count_nonzero(start.confidence())), seen, start.outlier_share)
     return replace(start, choices=replace(start.choices, reasons={**start.choices.reasons, "outliers": reason}))
 
 

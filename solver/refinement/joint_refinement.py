@@ -238,7 +238,7 @@ def _of_observations(evidence: Evidence, found: Learned, how: Refinement) -> tup
     estimate, used, should_stop = evidence.estimate, evidence.used, how.should_stop
     enter(should_stop, "observations")
     translations = np.array(estimate.translations)
-    completed = Moments(evidence.gram, evidence.sample, translations[used], estimate.outliers)
+    completed = Moments(evidence.gram, evidence.sample, translations[used], estimate.outlier_share)
     observed = Observed.of(evidence.normalized, estimate, used)
     found, moments = on_observations(observed, found, completed, evidence.start_scales[used], how)
     translations[used] = moments.translations

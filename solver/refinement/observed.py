@@ -78,7 +78,7 @@ class Moments:
     translations: Floats
     """Centroids, normalized units, shape `(F', 2)`."""
 
-    outliers: float
+    outlier_share: float
     """α, the share of outliers."""
 
 
@@ -123,7 +123,7 @@ def cross_fitted(
             iterations=START_EM_ROUNDS,
             should_stop=should_stop,
         )
-        image, weight, share = covariance.of_image(projections), observed.weight[:, own], estimate.outliers
+        image, weight, share = covariance.of_image(projections), observed.weight[:, own], estimate.outlier_share
         for _ in range(2):  # the second pass rejects the outliers of the first
             found[:, own], share = inlier_probabilities(
                 image, covariance.noise_variance, points[:, own], observed.confidence[:, own], weight, share=share
@@ -173,7 +173,7 @@ def _expected(observed: Observed, found: Learned, before: Moments, start_scales:
     projections = found.projections
     image, noise = found.covariance.of_image(projections), found.covariance.noise_variance
     probability, share = inlier_probabilities(
-        image, noise, points, observed.confidence, observed.weight, share=before.outliers
+        image, noise, points, observed.confidence, observed.weight, share=before.outlier_share
     )
     means, covariance = ImageDensity.of(image, noise).moments(points, observed.confidence * probability)
     middle = means.mean(axis=1)

@@ -117,7 +117,7 @@ class Completed:
     rank: int
     """Number of columns of the basis, translation included; 0 if nothing was filled."""
 
-    outliers: float
+    outlier_share: float
     """Share of the sample's visible entries, weighted by confidence, that were replaced as outliers."""
 
     filling: Filling | None = None

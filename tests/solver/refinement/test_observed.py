@@ -28,7 +28,7 @@ def begun(tracks: Tracks) -> tuple[Observed, object, Moments]:
     normalized = normalize(tracks)
     estimate = given_cameras(normalized, KNOWN, Settings())
     observed = Observed.of(normalized, estimate, USED)
-    completed = Moments(estimate.gram, estimate.sample, np.asarray(estimate.translations), estimate.outliers)
+    completed = Moments(estimate.gram, estimate.sample, np.asarray(estimate.translations), estimate.outlier_share)
     return observed, estimate, completed
 
 
@@ -68,7 +68,7 @@ def test_expected_moments_are_nearer_to_the_truth_than_completed_tracks(outliers
     flat = true.transpose(0, 2, 1).reshape(40, -1)
     gram = flat @ flat.T / flat.shape[1]
     assert np.linalg.norm(moments.gram - gram) < np.linalg.norm(completed.gram - gram)
-    assert moments.outliers == pytest.approx(outliers, abs=0.012)
+    assert moments.outlier_share == pytest.approx(outliers, abs=0.012)
 
 
 def test_perspective_is_corrected_with_the_depths_of_the_expected_tracks() -> None:
@@ -119,7 +119,7 @@ def test_outliers_are_kept_if_too_few_points_would_remain(monkeypatch: pytest.Mo
     monkeypatch.setattr(reconstruction, "cross_fitted", lambda *_, **__: (nothing, 0.5))
     found = estimate_cameras(tracks, KNOWN)
     assert np.array_equal(found.observations.normalized.points, normalize(tracks).points)
-    assert 0.05 < found.outliers < 0.15
+    assert 0.05 < found.outlier_share < 0.15
 
 
 @pytest.mark.slow
@@ -132,5 +132,5 @@ def test_outliers_do_not_affect_the_unit_of_the_tracks() -> None:
     clean = normalize(MADE.tracks).unit
     assert normalize(tracks).unit > 1.05 * clean
     assert found.observations.normalized.unit == pytest.approx(clean, rel=0.02)
-    assert found.outliers == pytest.approx(wrong.mean(), abs=0.015)
+    assert found.outlier_share == pytest.approx(wrong.mean(), abs=0.015)
     assert (found.observations.normalized.visible == tracks.visible).all()

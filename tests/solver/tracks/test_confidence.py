@@ -52,15 +52,15 @@ def test_completion_depends_only_on_the_ratios_of_confidences() -> None:
     weight[0, 0] = 1.0
     full, half = (complete(normalize(Tracks.from_arrays(SPOILED, weight * factor))) for factor in (1.0, 0.5))
     np.testing.assert_allclose(half.gram, full.gram, rtol=1e-9, atol=1e-9)
-    assert half.outliers == pytest.approx(full.outliers)
+    assert half.outlier_share == pytest.approx(full.outlier_share)
 
 
 def test_completion_ignores_outliers_of_very_low_confidence() -> None:
     little, hidden, trusted = (
         complete(normalize(Tracks.from_arrays(SPOILED, visible))) for visible in (LITTLE, NOTHING, None)
     )
-    assert trusted.outliers > 0.03
-    assert little.outliers < 1e-5
+    assert trusted.outlier_share > 0.03
+    assert little.outlier_share < 1e-5
     np.testing.assert_allclose(little.gram, hidden.gram, atol=3e-3 * np.abs(hidden.gram).max())
 
 
