@@ -119,7 +119,7 @@ class Perspective:
     """D of the latest cameras and covariance, shape `(F, 2F)`, or in factored form in long films."""
 
     @property
-    def bends(self) -> bool:
+    def is_perspective(self) -> bool:
         """Whether the tracks are corrected for perspective."""
         return self.curvature != 0
 
@@ -247,7 +247,7 @@ def orthographic(normalized: Normalized, view: Perspective | None) -> Normalized
 
     Without perspective, `normalized` itself is returned.
     """
-    if view is None or not view.bends:
+    if view is None or not view.is_perspective:
         return normalized
     return corrected_tracks(normalized, view, posterior_depths(view, normalized))
 

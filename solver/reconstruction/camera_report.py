@@ -37,7 +37,7 @@ def with_camera_choice(
     plain = settings.camera if settings.camera == "orthographic" else "scaled_orthographic"
     if view is None:
         return replace(choices, camera=plain, depth_sign="settled" if given else "ambiguous")
-    chosen = view.signs[0] if not view.bends else float(np.sign(view.flipped * view.curvature))
+    chosen = view.signs[0] if not view.is_perspective else float(np.sign(view.flipped * view.curvature))
     candidates = tuple(
         FocalCandidate(
             unit / abs(each.curvature) if each.curvature else None, bool(each.curvature * chosen < 0), each.nll
@@ -47,8 +47,8 @@ def with_camera_choice(
     warnings = improbable(view, unit), unknown_centre_warning(view, settings, known)
     return replace(
         choices,
-        camera="perspective" if view.bends else plain,
-        depth_sign="settled" if given or (view.bends and view.sign_known) else "ambiguous",
+        camera="perspective" if view.is_perspective else plain,
+        depth_sign="settled" if given or (view.is_perspective and view.sign_known) else "ambiguous",
         focal_candidates=candidates,
         reasons={**choices.reasons, "camera_model": described(view, unit)},
         warnings=(*choices.warnings, *(each for each in warnings if each is not None)),
@@ -58,7 +58,7 @@ def with_camera_choice(
 def described(view: Perspective, unit: float) -> str:
     """Return a sentence about the choice between orthography and perspective."""
     nll = {each.curvature: each.nll for each in view.candidates}
-    if not view.bends:
+    if not view.is_perspective:
         best = min((each for each in nll if each != 0), key=lambda each: nll[each], default=None)
         if best is None:
             return "Orthography: perspective was not compared."
@@ -93,6 +93,6 @@ def improbable(view: Perspective, unit: float) -> str | None:
 def unknown_centre_warning(view: Perspective, settings: Settings, known: KnownCamera | None) -> str | None:
     """Return a sentence if the principal point of a perspective camera is a guess; None otherwise."""
     given = settings.centre is not None or (known is not None and known.principal_point is not None)
-    if given or not view.bends:
+    if given or not view.is_perspective:
         return None
     return "Perspective was found, but the picture's size is unknown, so the middle of the tracks is taken as its centre. Give image_size."

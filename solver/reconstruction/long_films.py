@@ -84,7 +84,7 @@ def _views(observations: Observations, estimate: CameraEstimate, chosen: NDArray
     normalized, view = observations.normalized, estimate.perspective
     points = normalized.points[:, chosen].transpose(0, 2, 1)
     weight = normalized.visible[:, chosen]
-    if view is None or not view.bends or observations.lens is None:
+    if view is None or not view.is_perspective or observations.lens is None:
         return Views(np.ascontiguousarray(points), weight)
     return Views(points + observations.lens.offsets[:, :, None], weight, view.curvature)
 
@@ -189,7 +189,7 @@ def _perspective(
     if view is None or lens is None:
         return view
     view = replace(view, offsets=lens.offsets, filling=filling)
-    if not view.bends:
+    if not view.is_perspective:
         return replace(view, learning_sample=np.zeros((0, 0, 2)))
     seen = _filled(views, shapes, poses, as_seen=True)
     return replace(view, learning_sample=seen, depth=depth_map(rotations, scales, covariance))

@@ -46,7 +46,7 @@ def shapes_from(start: Start, monitor: Monitor, *, seconds: dict[str, float], ch
 def _minimised(start: Start, history: list[State], monitor: Monitor) -> tuple[Start, list[State], Outcome]:
     """Return the start, its tracks corrected for perspective with the depths of the shapes, the history, and the outcome."""
     view = start.estimate.perspective
-    corrections = DEPTH_ROUNDS if view is not None and view.bends else 0
+    corrections = DEPTH_ROUNDS if view is not None and view.is_perspective else 0
     if corrections > 0:
         monitor.expect([replace(monitor.current, name="corrections")], before="finish")
     history, outcome = _loop(start, history, monitor)

@@ -46,7 +46,7 @@ def correct_perspective(evidence: Evidence, how: Refinement) -> Evidence:
     )
     cameras = view.learning_sample[used], evidence.rotations, evidence.start_scales[used]
     view, found = search(*cameras, view, how)
-    if not view.bends:
+    if not view.is_perspective:
         return replace(evidence, estimate=replace(estimate, perspective=view))
     reached, best = _correct_from(evidence, found, view, how)
     if not how.turning or is_planar(reached.estimate.gram):
@@ -124,7 +124,7 @@ def with_depth_map(
 ) -> CameraEstimate:
     """Return the estimate with D of this covariance and these cameras, in the same axes, if tracks are corrected."""
     view = estimate.perspective
-    if view is None or not view.bends:
+    if view is None or not view.is_perspective:
         return estimate
     depth = depth_map(rotations, scales, covariance)
     return replace(estimate, perspective=replace(view, depth=depth))

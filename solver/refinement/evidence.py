@@ -49,9 +49,9 @@ class Evidence:
         return Evidence.of(estimate, self.normalized, self.used, self.start_scales)
 
     @property
-    def bends(self) -> bool:
+    def is_perspective(self) -> bool:
         """Whether the tracks show perspective, which makes the sign of depth observable."""
-        return self.estimate.perspective is not None and self.estimate.perspective.bends
+        return self.estimate.perspective is not None and self.estimate.perspective.is_perspective
 
     @property
     def rotations(self) -> Floats:

@@ -94,7 +94,7 @@ def refine_cameras(
         # without and with the limit: shark with all errors .063 and .088, face landmarks .027 and .024.
         model_order = replace(model_order, max_modes=MAX_MODES)
     estimate, rotations = _of_all_frames(start, evidence, found, trial)
-    if not evidence.bends and not bulges(found, evidence.sample, y_up=y_up):
+    if not evidence.is_perspective and not bulges(found, evidence.sample, y_up=y_up):
         estimate, rotations, found = _mirrored(estimate, rotations, found)
     return estimate, LearningData(
         evidence.gram, evidence.sample, found.projections, evidence.used, model_order,
@@ -161,19 +161,19 @@ def _at_all_frames(used: NDArray[np.intp], scales: Floats, frames: int) -> Float
 
 def _refined(evidence: Evidence, trial: ScaleTrial | None, how: Refinement) -> tuple[Evidence, Learned]:
     """Return the tracks, corrected with the refined depths, and the refined cameras and covariance of the frames used."""
-    estimate, bends, should_stop = evidence.estimate, evidence.bends, how.should_stop
+    estimate, is_perspective, should_stop = evidence.estimate, evidence.is_perspective, how.should_stop
     may_couple = how.model_order == ModelOrder(ordered=estimate.ordered)
     enter(should_stop, "refinement", units=REFINEMENT_UNITS[may_couple])
     found = _first_rounds(evidence, trial, how)
-    if bends:
+    if is_perspective:
         evidence, found = update_correction(evidence, found, how)
     if may_couple and full_mode_covariance.is_identifiable(found.covariance, estimate.sample.shape[1]):
         found = _coupled(evidence.gram, found, how)
-        if bends:
+        if is_perspective:
             evidence, found = update_correction(evidence, found, how)
     if not np.isfinite(found.energy):
         return evidence, found
-    return _with_probable_focal(evidence, found) if bends else _with_probable_depth(evidence, found, how)
+    return _with_probable_focal(evidence, found) if is_perspective else _with_probable_depth(evidence, found, how)
 
 
 def _first_rounds(evidence: Evidence, trial: ScaleTrial | None, how: Refinement) -> Learned:
@@ -274,6 +274,6 @@ def _with_depth_choice(estimate: CameraEstimate, stretch: float) -> CameraEstima
         f"The tracks hardly distinguish depth from rotation: {1 / stretch:.2g} times the depth with {stretch:.2g} times the rotation "
         "explains them about as well. A depth typical for the width is assumed, like that of half a sphere."
     )
-    if estimate.perspective is not None and estimate.perspective.bends:
+    if estimate.perspective is not None and estimate.perspective.is_perspective:
         sentence += " The focal length shows the tracks' perspective at this depth."
     return replace(estimate, depth_is_typical=True, reasons={**estimate.reasons, "depth_extent": sentence})

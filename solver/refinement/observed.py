@@ -60,7 +60,7 @@ class Observed:
         points, confidence = normalized.points[:, chosen], normalized.visible[:, chosen]
         weight = np.where(estimate.filling.outliers(points, confidence), 0.0, confidence)
         view = estimate.perspective
-        view = replace(view, offsets=view.offsets[used]) if view is not None and view.bends else None
+        view = replace(view, offsets=view.offsets[used]) if view is not None and view.is_perspective else None
         often = often_visible(normalized.visible)[chosen]
         return cls(points[used], confidence[used], weight[used], chosen, often, view)
 

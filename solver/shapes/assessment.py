@@ -164,7 +164,7 @@ def _unclear_camera(view: Perspective | None, unit: float) -> str | None:
     found = None if view is None else unclear_perspective(view)
     if view is None or found is None:
         return None
-    if view.bends:
+    if view.is_perspective:
         return (
             "Perspective explains the tracks hardly better than orthography, so the focal length is uncertain. Give the focal length, or "
             "compare with camera=scaled_orthographic."

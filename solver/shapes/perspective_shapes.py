@@ -65,7 +65,7 @@ def seen_in_perspective(
     the difference in depth, 1 + κ(z + c) = (1 + κc)(1 + κz/(1 + κc)), so scales and translations are divided by 1 + κc.
     """
     camera = replace(solution.camera, principal_point=np.array(view.principal_point))
-    if not view.bends:
+    if not view.is_perspective:
         return replace(solution, camera=camera)
     focal = unit / abs(view.curvature)
     scales, translations = camera.scales, camera.translations
