@@ -99,9 +99,12 @@ class Reconstruction:
         return self.arrays.get("shapes_std")
 
     @property
-    def inlier_probability(self) -> NDArray[np.float32]:
-        """Posterior probability that an observation is an inlier, shape (F, P): 0 where rejected, NaN where hidden."""
-        return self.arrays["inlier_probability"]
+    def inlier_probability(self) -> NDArray[np.float32] | None:
+        """Posterior probability that an observation is an inlier, shape (F, P): 0 where rejected, NaN where hidden.
+
+        None in results of earlier versions.
+        """
+        return self.arrays.get("inlier_probability")
 
     @property
     def point_names(self) -> tuple[str, ...] | None:

@@ -42,12 +42,6 @@ def work(settings: Settings) -> int:
     The modules of a job are imported once, before the first fork. This is safe because this process does no numerical work:
     the numerical library stops its threads in the fork and restarts them in the job process.
     """
-    quick, text = (
-        connect(settings.redis, decode=decode, retries=0, answer_within=WATCH_ANSWERS_WITHIN)
-        for decode in (False, True)
-    )
-    records = RedisRecords(text, prefix=settings.queue)
-    records.ping()  # the supervisor repeats a start without a store
     for variable in NUMERICAL_THREADS:
         os.environ.setdefault(variable, "1")
     for module in PRELOADED:
@@ -55,7 +49,13 @@ def work(settings: Settings) -> int:
     gc.collect()
     gc.freeze()  # otherwise the first garbage collection of every job process would copy all shared pages
     make_data_directory(settings.data)
+    quick, text = (
+        connect(settings.redis, decode=decode, retries=0, answer_within=WATCH_ANSWERS_WITHIN)
+        for decode in (False, True)
+    )
     connection = connect(settings.redis, decode=False, answer_within=BLOCK_WITHIN)
+    records = RedisRecords(text, prefix=settings.queue)
+    records.ping()  # the supervisor repeats a start without a store
     with reachable():  # RQ connects at once
         worker = PliantWorker(
             settings=settings,

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from typing import NamedTuple
 
 from pliant.schemas.job import Job, Priority, Status
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 EVENTS_KEPT = 256
 """Maximum number of events kept per job; older ones are dropped."""
@@ -53,14 +53,17 @@ class StoredShare(BaseModel):
 class Stored(BaseModel):
     """A job with the internal fields of the worker package."""
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
+    model_config = ConfigDict(
+        frozen=True, extra="ignore", validate_by_name=True, validate_by_alias=True, serialize_by_alias=True
+    )
 
     job: Job
     owner: str = ""
     """Owner of the job, empty without authentication."""
 
-    attempt_id: str
-    """The only attempt that may write; RQ carries this id. Every requeue changes it."""
+    attempt_id: str = Field(validation_alias="token", serialization_alias="token")
+    """The only attempt that may write; RQ carries this id. Every requeue changes it.
+    Stored under the name `token`."""
 
     inputs: str
     """Blob of the canonical inputs."""
@@ -97,6 +100,9 @@ class Stored(BaseModel):
 
     version: int = 0
     """Number of changes, for the compare-and-set."""
+
+    record_schema: int = Field(2, validation_alias="schema", serialization_alias="schema")
+    """Version of the record's format; see `pliant.worker.store.schema`."""
 
     @property
     def sort_key(self) -> str:

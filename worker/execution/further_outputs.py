@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.schemas.job import Job, Progress
 from pliant.solver import Camera, Choices, Outcome, Solution, Trace
 from pliant.worker.artifacts import kinds_for
@@ -21,13 +22,15 @@ from pliant.worker.formats import Inputs, load_inputs
 from pliant.worker.formats.canonical import OWN_FILES
 from pliant.worker.formats.errors import damaged
 from pliant.worker.formats.reading.arrays import read_file
+from pliant.worker.formats.records import Arrays
 from pliant.worker.jobs.finished import Finished
 
 SHARES = {"loading": (0.0, 0.1), "exporting": (0.1, 1.0)}
 _NEEDED = frozenset(
     ("shapes", "rotations", "scales", "translations", "focal", "focal_std", "principal_point", "residuals", "weights",
-     "inlier_probability", "trace_objective", "trace_residual", "trace_iterations")
+     "trace_objective", "trace_residual", "trace_iterations")
 )  # fmt: skip
+_OPTIONAL = frozenset(("shapes_std", "inlier_probability"))
 
 
 def write_further(
@@ -93,7 +96,7 @@ def read_solution(path: Path, *, y_up: bool) -> Solution:
     InvalidInput
         Code damaged_file: the file was not written by Pliant or is damaged.
     """
-    arrays = read_file(path, field="result", limits=OWN_FILES, wanted=_NEEDED | {"shapes_std"})
+    arrays = read_file(path, field="result", limits=OWN_FILES, wanted=_NEEDED | _OPTIONAL)
     missing = sorted(_NEEDED - set(arrays))
     if missing:
         raise damaged("result", f"a shapes.npz without {', '.join(missing)}")
@@ -115,9 +118,13 @@ def read_solution(path: Path, *, y_up: bool) -> Solution:
             low_rank_weight=unknown, laplacian="", unit=unknown, noise=unknown,
         ),
         seconds={},
-        shapes_std=np.asarray(arrays["shapes_std"], dtype=np.float64) if "shapes_std" in arrays else None,
-        inlier_probability=held["inlier_probability"],
+        shapes_std=_optional(arrays, "shapes_std"),
+        inlier_probability=_optional(arrays, "inlier_probability"),
     )  # fmt: skip
+
+
+def _optional(arrays: Arrays, name: str) -> NDArray[np.float64] | None:
+    return np.asarray(arrays[name], dtype=np.float64) if name in arrays else None
 
 
 def _inputs(file: Path, job: Job) -> Inputs:

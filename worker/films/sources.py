@@ -112,11 +112,12 @@ def open_source(path: Path, folder: Path) -> FilmSource:
             if stated["version"] != VERSION:
                 raise damaged("inputs", f"a stored film of version {stated['version']} instead of {VERSION}")
             film = _unpacked(archive, _FILM, folder / f"film{stated['film']}")
-            region, names = stated["region"], stated["names"]
+            region = stated["region"]
+            names = stated.get("names", {})  # sources stored by earlier versions have none
             return FilmSource(
                 film, None if region is None else _unpacked(archive, _REGION, folder / f"region{region}"),
                 film_name=str(names.get("film", "")), region_name=str(names.get("region", "")),
-                own_rate=bool(stated["own_rate"]),
+                own_rate=bool(stated.get("own_rate", True)),  # earlier versions took the rate that the file states
             )  # fmt: skip
     except (zipfile.BadZipFile, KeyError, ValueError, TypeError, AttributeError) as error:
         raise damaged("inputs", "a stored film that cannot be read back") from error

@@ -2,7 +2,7 @@
 
 Keys, all under one prefix::
 
-    job:<id>              hash: version, status, attempt_id, owner, sort, bytes, key, beat, most, priority,
+    job:<id>              hash: version, status, token (the attempt id), owner, sort, bytes, key, beat, most, priority,
                           body (JSON of `Stored`)
     index:*:<status>      sorted set of sort keys, all jobs of a status; index:@<owner>:<status> the owner's
     events:<id>, log:<id> stream and list, both capped
@@ -44,7 +44,7 @@ from pliant.worker.records import (
 )
 from pliant.worker.store.changes import RedisChanges
 from pliant.worker.store.connection import reachable
-from pliant.worker.store.schema import check_version
+from pliant.worker.store.schema import prepare
 
 # ARGV: 1 prefix, 2 id, 3 version, 4 status, 5 attempt id, 6 owner, 7 sort key, 8 bytes, 9 key digest, 10 body, 11 event, 12 data, 13 cap,
 # 14 maximum queued jobs of the owner (0: no limit), 15 maximum running ones by the owner's token ('': not set),
@@ -61,7 +61,7 @@ if most > 0 and redis.call('ZCARD', at .. 'index:@' .. ARGV[6] .. ':queued') >= 
 local bytes = tonumber(ARGV[16])
 if bytes > 0 and tonumber(redis.call('GET', at .. 'used') or 0) + tonumber(ARGV[8]) > bytes then return '!space' end
 if ARGV[9] ~= '' then redis.call('SET', at .. 'key:' .. ARGV[9], ARGV[2]) end
-redis.call('HSET', at .. 'job:' .. ARGV[2], 'version', ARGV[3], 'status', ARGV[4], 'attempt_id', ARGV[5], 'owner', ARGV[6],
+redis.call('HSET', at .. 'job:' .. ARGV[2], 'version', ARGV[3], 'status', ARGV[4], 'token', ARGV[5], 'owner', ARGV[6],
   'sort', ARGV[7], 'bytes', ARGV[8], 'key', ARGV[9], 'body', ARGV[10], 'beat', 0,
   'most', ARGV[15], 'priority', ARGV[17])
 redis.call('ZADD', at .. 'index:*:' .. ARGV[4], 0, ARGV[7])
@@ -82,7 +82,7 @@ local at, job = ARGV[1], ARGV[1] .. 'job:' .. ARGV[2]
 local held = redis.call('HMGET', job, 'version', 'status', 'owner', 'sort', 'bytes', 'body')
 if held[1] == ARGV[4] and held[6] == ARGV[8] then return 1 end
 if held[1] ~= ARGV[3] then return 0 end
-redis.call('HSET', job, 'version', ARGV[4], 'status', ARGV[5], 'attempt_id', ARGV[6], 'bytes', ARGV[7], 'body', ARGV[8])
+redis.call('HSET', job, 'version', ARGV[4], 'status', ARGV[5], 'token', ARGV[6], 'bytes', ARGV[7], 'body', ARGV[8])
 if held[2] ~= ARGV[5] then
   for _, who in ipairs({'*', '@' .. held[3]}) do
     redis.call('ZREM', at .. 'index:' .. who .. ':' .. held[2], held[4])
@@ -102,7 +102,7 @@ return 1
 # ARGV: 1 prefix, 2 id, 3 milliseconds since 1970, 4 attempt id
 _DELETE = """
 local at, job = ARGV[1], ARGV[1] .. 'job:' .. ARGV[2]
-local held = redis.call('HMGET', job, 'status', 'owner', 'sort', 'bytes', 'key', 'attempt_id')
+local held = redis.call('HMGET', job, 'status', 'owner', 'sort', 'bytes', 'key', 'token')
 if held[6] ~= ARGV[4] then return 0 end
 redis.call('ZREM', at .. 'index:*:' .. held[1], held[3])
 redis.call('ZREM', at .. 'index:@' .. held[2] .. ':' .. held[1], held[3])
@@ -119,7 +119,7 @@ return 1
 # ARGV: 1 prefix, 2 id, 3 attempt id
 _BEAT = """
 local job = ARGV[1] .. 'job:' .. ARGV[2]
-local held = redis.call('HMGET', job, 'attempt_id', 'status')
+local held = redis.call('HMGET', job, 'token', 'status')
 if held[1] ~= ARGV[3] then return false end
 redis.call('HINCRBY', job, 'beat', 1)
 return held[2]
@@ -149,10 +149,10 @@ class RedisRecords(Records):
 
     @contextmanager
     def _checked(self) -> Iterator[None]:
-        """Translate errors of the store; before the first use, check the version of the records."""
+        """Translate errors of the store; before the first use, check the version of the records and migrate older ones."""
         with reachable():
             if not self._is_current:
-                check_version(self._redis, self._prefix)
+                prepare(self._redis, self._prefix)
                 self._is_current = True
             yield
 
@@ -267,7 +267,7 @@ class RedisRecords(Records):
 
     def look(self, id: str, attempt_id: str) -> Status | None:
         with self._checked():
-            held, status = self._redis.hmget(f"{self._at}job:{id}", "attempt_id", "status")
+            held, status = self._redis.hmget(f"{self._at}job:{id}", "token", "status")
         return Status(status) if held == attempt_id else None
 
     def beats(self, ids: Iterable[str]) -> dict[str, Beat]:
@@ -275,7 +275,7 @@ class RedisRecords(Records):
         with self._checked():
             pipe = self._redis.pipeline(transaction=False)
             for id in wanted:
-                pipe.hmget(f"{self._at}job:{id}", "attempt_id", "beat", "owner", "most", "priority")
+                pipe.hmget(f"{self._at}job:{id}", "token", "beat", "owner", "most", "priority")
             answers = pipe.execute()
         return {
             id: Beat(attempt_id, int(beat), owner, int(most) if most else None, priority or "normal")

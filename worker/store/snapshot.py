@@ -11,6 +11,7 @@ from pliant.worker.records import Stored
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect, reachable
 from pliant.worker.store.redis import RedisRecords
+from pliant.worker.store.schema import migrated
 
 # ARGV: 1 prefix, 2 id. Record, log and pending webhook are read atomically.
 _READ = """
@@ -61,8 +62,8 @@ class Snapshot:
         return self._records.count(list(Status)) == 0 and not self.rest()["tokens"]
 
     def write(self, job: dict[str, Any]) -> Stored:
-        """Write a job of a snapshot; the store must not contain its id."""
-        stored = self._records.create(Stored.model_validate(job["record"]))
+        """Write a job of a snapshot, migrated if it is older; the store must not contain its id."""
+        stored = self._records.create(Stored.model_validate(migrated(job["record"])))
         self._records.append_log(stored.job.id, job["log"])
         if job["due"] is not None:
             with reachable():
