@@ -40,9 +40,20 @@ def warnings_unread(*, whole: bool = False, region_frame: int = 0, frames: int =
 
 
 def warnings_before(
-    film: Film, found: Survey, start: int, stop: int, *, whole: bool, rough: float, region_frame: int = 0
+    film: Film,
+    found: Survey,
+    start: int,
+    stop: int,
+    *,
+    whole: bool,
+    rough: float,
+    region_frame: int = 0,
+    lost_in_middle: bool = False,
 ) -> list[str]:
-    """Return warnings about the film in rows `start` to `stop`: region, shots, length, frame rate, and texture in a share `rough`."""
+    """Return warnings about the film in rows `start` to `stop`: region, shots, length, frame rate, and texture in a share `rough`.
+
+    `lost_in_middle` as in `planning.plan.Plan`.
+    """
     notes = warnings_unread(whole=whole, region_frame=region_frame)
     if found.cuts:
         count, first = len(found.cuts), found.indices[found.cuts[0]]
@@ -60,6 +71,11 @@ def warnings_before(
     steps = np.diff(found.times[start:stop])
     if film.container in ("mp4", "matroska", "avi", "gif") and steps.max() > UNEVEN * np.median(steps):
         notes.append("The time between frames varies; frame_times holds the true times.")
+    if lost_in_middle:
+        notes.append(
+            "The region was mostly lost on the way to the middle of the film, so points are followed from the frame in which it was drawn. "
+            "Far from this frame the tracks are less accurate. Draw the region on a frame in the middle."
+        )
     if rough < 0.5:
         notes.append(
             f"Only {rough:.0%} of the region has texture; the mesh has holes elsewhere. Film in focus and in good light, or "
@@ -120,7 +136,7 @@ def warnings_of(
     if uncertain >= MANY_UNCERTAIN:
         notes.append(
             f"In {uncertain:.0%} of the visible positions, the picture fits the template poorly; these points may be off by several "
-            "pixels, and the shapes follow them. Film closer, sharper or in better light, or select frames in which the surface changes "
-            "less."
+            "pixels, and the shapes follow them. Film closer, sharper or in better light, choose a surface without a repeating pattern, or "
+            "select frames in which the surface changes less."
         )
     return notes

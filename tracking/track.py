@@ -132,8 +132,9 @@ def _track(run: Run, found: Survey, plan: Plan, step: float | None, *, whole: bo
     template = run.store.read(plan.template)
     seeds, textured = _placed(template, plan, step)
     notes = warnings_before(
-        run.film, found, plan.start, plan.stop, whole=whole, region_frame=region_frame, rough=textured
-    )
+        run.film, found, plan.start, plan.stop, whole=whole, region_frame=region_frame, rough=textured,
+        lost_in_middle=plan.lost_in_middle,
+    )  # fmt: skip
     run.on_warnings(notes)
     appearance = Appearance.of(template, plan.mask, seeds.points, neighbours(seeds.grid, len(seeds.points)))
     fine = Registration.of(template, seeds.points, seeds.grid, noise=appearance.noise)

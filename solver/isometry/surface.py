@@ -157,6 +157,13 @@ def _search(tracks: Tracks, centre: Floats, focal: float, required: bool, should
     return against or search or TOO_LITTLE
 
 
+def _unrecognised_warning() -> str:
+    return (
+        "The object was not recognised as a sheet that keeps its lengths, such as paper or cloth seen from nearby. If it is one, try "
+        "surface=isometric and compare."
+    )
+
+
 def _verdict(
     search: FocalSearch, tracks: Tracks, tried: list[Tried], focal: float | None, required: bool
 ) -> IsometricVerdict:
@@ -166,7 +173,8 @@ def _verdict(
     supported, why = _confirmed(search, chosen, judgement) if judgement.ratio > 0 else (False, judgement.words)
     if not supported and not required:
         advice = "If it is one that keeps its lengths, such as paper or cloth seen from nearby, try surface=isometric and compare."
-        return IsometricVerdict(f"Rejected as an isometric sheet: {why}. {advice}", _trace(tried))
+        reason = f"Rejected as an isometric sheet: {why}. {advice}"
+        return IsometricVerdict(reason, _trace(tried), warnings=(_unrecognised_warning(),))
     warnings = _warnings(None if supported else why, focal, least, chosen)
     if not supported:
         why = f"Solved as an isometric sheet, as set, although {why}."

@@ -69,7 +69,7 @@ def described(view: Perspective, unit: float) -> str:
     compared = [each for each in nll if each != 0 and (view.given is None or abs(each) == view.given)]
     own = min((nll[each] for each in compared), default=nll[0.0])
     std = view.focal_std(unit)
-    how = "as given" if view.given is not None else "" if std is None else f"± {float(f'{std:.2g}'):g}"
+    how = "as given" if view.given is not None else "" if std is None else f"± {float(f'{std:.2g}'):g} from noise alone"
     gains = f"gains {nll[0.0] - own:.3f} in the log likelihood per point and frame over orthography"
     length = f"{unit / abs(view.curvature):.4g} {how}".strip()
     if own >= UNLIKELY:

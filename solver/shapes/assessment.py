@@ -155,12 +155,17 @@ def judged(
 
 
 def _unclear_camera(view: Perspective | None, unit: float) -> str | None:
-    """Return a sentence if the tracks contradict the given focal length, or hardly distinguish perspective from orthography.
+    """Return a sentence if the tracks favour another focal length than the given one, or hardly show whether there is perspective.
 
     `unit` is the tracks' unit per normalized unit.
     """
-    if view is not None and more_probable(view) is not None:
-        return "The tracks contradict the given focal length. Check it, and solve without it to compare."
+    other = None if view is None else more_probable(view)
+    if other is not None:
+        instead = f"A focal length of {unit / abs(other[0]):.4g}" if other[0] else "Orthography"
+        return (
+            f"{instead} explains the tracks better than the given focal length. Either the given one is wrong, or the object deforms in a "
+            "way that resembles perspective. Check it; if it is certain, keep it."
+        )
     found = None if view is None else unclear_perspective(view)
     if view is None or found is None:
         return None

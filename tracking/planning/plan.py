@@ -46,6 +46,9 @@ class Plan:
     template: int
     mask: Bools
 
+    lost_in_middle: bool = False
+    """Whether the template is the region's frame only because the region is mostly lost in the middle of the shot."""
+
 
 def plan_of(run: Run, found: Survey, mask: Bools | None, *, region_frame: int, template_frame: int | None) -> Plan:
     """Choose shot and template, and carry the region, a mask `(H, W)` of the film's size in `region_frame`, to the template.
@@ -80,12 +83,13 @@ def plan_of(run: Run, found: Survey, mask: Bools | None, *, region_frame: int, t
         return Plan(start, stop, middle if template is None else template, np.ones(shape, dtype=bool))
     height, width = run.store.read(0).shape
     scaled = np.asarray(cv2.resize(mask.astype(np.uint8) * 255, (width, height), interpolation=cv2.INTER_AREA) >= 128)
-    if template is None and origin not in middle_of(start, stop):
+    lost = template is None and origin not in middle_of(start, stop)
+    if lost:
         carried = _carried(run, scaled, origin, middle)
         if carried.sum() >= LEAST_LEFT_BY_DEFAULT * scaled.sum():
             return Plan(start, stop, middle, carried)
     template = min(max(origin, start), stop - 1) if template is None else template
-    return Plan(start, stop, template, scaled if template == origin else _carry(run, scaled, origin, template))
+    return Plan(start, stop, template, scaled if template == origin else _carry(run, scaled, origin, template), lost)
 
 
 def _shot(found: Survey, row: int | None) -> tuple[int, int]:

@@ -267,7 +267,7 @@ def test_a_wrong_focal_length_is_used_and_reported_as_improbable() -> None:
     assert found.camera.focal == pytest.approx(3 * FOCAL)
     assert any("improbable" in warning for warning in found.choices.warnings)
     assert found.trust is not None
-    assert "The tracks contradict the given focal length." in " ".join(found.trust.reasons)
+    assert "explains the tracks better than the given focal length." in " ".join(found.trust.reasons)
 
 
 def test_a_field_of_view_is_a_focal_length() -> None:

@@ -56,6 +56,7 @@ def test_a_surface_that_the_halves_do_not_confirm_is_rejected(monkeypatch: pytes
     why = "its edge lengths differ by 40% between halves of the frames"
     advice = "If it is one that keeps its lengths, such as paper or cloth seen from nearby, try surface=isometric and compare."
     assert refused.reason == f"Rejected as an isometric sheet: {why}. {advice}"
+    assert [each for each in refused.warnings if each.startswith("The object was not recognised as a sheet")]
     required = isometric_surface(tracks, focal=FOCAL, image_size=SIZE, required=True)
     assert required.surface is not None
     assert required.reason == f"Solved as an isometric sheet, as set, although {why}."
