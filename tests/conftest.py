@@ -8,6 +8,7 @@ import secrets
 import shutil
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import sysconfig
@@ -15,7 +16,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import certifi
 import pytest
@@ -41,6 +42,17 @@ AUTHORITY.write(
 )
 AUTHORITY.flush()
 certifi.where = lambda: AUTHORITY.name
+
+
+BUNDLE, create_default_context = os.environ.get("SSL_CERT_FILE"), ssl.create_default_context
+"""The variable has priority, and stays: processes that install packages need it."""
+
+
+def with_one_authority(*purpose: ssl.Purpose, cafile: str | None = None, **others: Any) -> ssl.SSLContext:
+    return create_default_context(*purpose, cafile=AUTHORITY.name if cafile and cafile == BUNDLE else cafile, **others)
+
+
+ssl.create_default_context = with_one_authority
 
 # Typer rebuilds all commands whenever a test invokes one.
 typer.testing._get_command = functools.cache(typer.testing._get_command)
