@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import functools
+import gc
 import os
 import secrets
 import shutil
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import sysconfig
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import certifi
 import pytest
@@ -42,8 +44,31 @@ AUTHORITY.write(
 AUTHORITY.flush()
 certifi.where = lambda: AUTHORITY.name
 
+
+BUNDLE, create_default_context = os.environ.get("SSL_CERT_FILE"), ssl.create_default_context
+"""The variable has priority, and stays: processes that install packages need it."""
+
+
+def with_one_authority(*purpose: ssl.Purpose, cafile: str | None = None, **others: Any) -> ssl.SSLContext:
+    return create_default_context(*purpose, cafile=AUTHORITY.name if cafile and cafile == BUNDLE else cafile, **others)
+
+
+ssl.create_default_context = with_one_authority
+
 # Typer rebuilds all commands whenever a test invokes one.
 typer.testing._get_command = functools.cache(typer.testing._get_command)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Load the tests without garbage collections, and leave what is loaded out of later ones: each would take half a second."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+        gc.collect()
+        gc.freeze()
 
 
 @pytest.fixture(scope="session")

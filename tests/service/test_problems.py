@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import httpx
@@ -17,17 +16,20 @@ ROOT = Path(__file__).parents[2]
 FOLDERS = ("schemas", "solver", "tracking", "worker", "service", "client", "cli")
 
 
-@cache
-def sources() -> list[tuple[Path, list[ast.AST]]]:
+Sources = list[tuple[Path, list[ast.AST]]]
+"""Every module with its nodes. They are not kept: half a million objects slow down each garbage collection of later tests."""
+
+
+def read_sources() -> Sources:
     paths = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
     return [(path, list(ast.walk(ast.parse(path.read_text())))) for path in paths if "testing" not in path.parts]
 
 
-def code_parameters() -> dict[str, int]:
+def code_parameters(sources: Sources) -> dict[str, int]:
     """Return, by qualified name, the position of the parameter `code` of every function and class that has one."""
     found = {"pliant.schemas.invalid.Invalid": 0}
     heirs: dict[str, list[str]] = {}
-    for path, nodes in sources():
+    for path, nodes in sources:
         module = "pliant." + ".".join(path.relative_to(ROOT).with_suffix("").parts)
         for node in nodes:
             if isinstance(node, ast.ClassDef):
@@ -78,10 +80,11 @@ def literals(node: ast.expr) -> Iterator[str]:
 
 def raised_codes() -> dict[str, str]:
     """Return every code that the sources use, with one place for each."""
-    parameters = code_parameters()
+    sources = read_sources()
+    parameters = code_parameters(sources)
     short = {name.rsplit(".", 1)[1] for name in parameters}
     found: dict[str, str] = {}
-    for path, nodes in sources():
+    for path, nodes in sources:
         module = "pliant." + ".".join(path.relative_to(ROOT).with_suffix("").parts)
         names = {name.rsplit(".", 1)[1]: name for name in parameters if name.startswith(f"{module}.")}
         for node in nodes:
