@@ -20,8 +20,8 @@ from pliant.solver.solution import Solution
 
 INTERVAL = (0.35, 3.6)
 """Ends of the interval for the error, relative to the expected error: about the 10 and 90 % quantiles of true over expected error on the
-calibration sequences of `benchmarks.trust` when they were chosen. Now they contain 46 of 56, and 51 of 71 of the other sequences; in 22 of
-the other 30 solves the error is smaller. In `benchmarks.accuracy.kinds` the intervals contain 26 of 55; the other errors are larger."""
+calibration sequences of `benchmarks.trust` when they were chosen. Now they contain 46 of 54, and 51 of 71 of the other sequences; in 20 of
+the other 28 solves the error is smaller. In `benchmarks.accuracy.kinds` the intervals contain 26 of 55; the other errors are larger."""
 
 POOR, BAD = 0.2, 1.8
 """Upper end of the error interval, relative to the size, from which the verdict is `with_care` and `do_not_use`. With `POOR`, no solve of
@@ -34,8 +34,8 @@ leaves .06. A prior with as many modes as frames fits anything; `LOST_HELD_OUT` 
 NARROW, STILL = 20.0, 5.0
 """Angle between the two most different views, degrees, for the same two verdicts. The error of depth grows as the inverse of the angle.
 Below `NARROW` the expected error is a lower bound: if the camera hardly moves, deformation is taken for a turn, which the standard
-deviations do not include. Of 5 solves of `benchmarks.trust` between `STILL` and `NARROW` with a body that stands still, 4 have errors of
-5 to 7 times the expected one."""
+deviations do not include. The four solves of `benchmarks.trust` in between whose body stands still have errors of 5 to 7 times the
+expected one."""
 
 LEAST_TURN = 1.0
 """Rotation of the camera per frame, radians, divided by the deformation per frame, relative to the size (medians over a film), below which

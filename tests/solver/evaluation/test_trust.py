@@ -171,6 +171,13 @@ def test_the_most_severe_reason_comes_first() -> None:
     assert "at least" in trust.sentence
 
 
+@pytest.mark.parametrize(("turn", "bounded"), [(12.0, False), (19.0, False), (21.0, True)])
+def test_with_little_turn_the_expected_error_is_a_lower_bound(turn: float, bounded: bool) -> None:
+    trust = judged(turn=turn)
+    assert (trust.interval is not None) == bounded
+    assert ("about" if bounded else "at least") in trust.sentence
+
+
 def test_without_a_posterior_the_error_is_not_estimated() -> None:
     trust = judged(shapes_std=None)
     assert trust.expected_error is None
