@@ -290,3 +290,16 @@ def test_the_most_confident_observation_counts_as_one() -> None:
     shown = observations.without(surer.visible == 1.0)
     assert shown.normalized.visible.max() == 1.0
     assert shown.with_all().normalized.visible.max() == 1.0
+
+
+@pytest.mark.parametrize("wrong", [Tracks(MADE.tracks.points.astype(int), MADE.tracks.visible), MADE.tracks.points])
+def test_every_stage_refuses_tracks_made_without_validation(wrong: Tracks, cameras: Cameras, prior: Prior) -> None:
+    for stage, more in (
+        (estimate_cameras, ()),
+        (learn_prior, (cameras,)),
+        (find_outliers, (cameras, prior)),
+        (solve_shapes, (cameras, prior)),
+    ):
+        with pytest.raises(InvalidInput, match=r"Tracks\.from_arrays") as caught:
+            stage(wrong, *more)  # type: ignore[operator]
+        assert (caught.value.code, caught.value.field) == ("wrong_type", "tracks")
