@@ -104,6 +104,8 @@ def test_reprs_are_short(cameras: Cameras, prior: Prior, solution: Solution) -> 
     assert repr(cameras) == "<Cameras of 8 frames, orthographic>"
     assert repr(prior).startswith("<Prior of 8 frames: ")
     assert repr(solution).startswith(f"<Solution of 8 frames × {MADE.tracks.num_points} points, converged")
+    assert repr(solution.camera) == "<Camera of 8 frames, orthographic>"
+    assert repr(replace(solution.camera, focal=912.34)) == "<Camera of 8 frames, focal length 912.3>"
     assert all(len(repr(each)) < 90 for each in (cameras, prior, solution))
 
 
