@@ -12,6 +12,7 @@ from pliant.schemas.job import LONGEST_NAME, Interpretation, Job, Priority
 from pliant.schemas.options import Options
 from pliant.schemas.problems import ProblemCode
 from pliant.schemas.suggestions import closest
+from pliant.schemas.validation import alternatives
 from pliant.service.multipart import File, Form, FormRules, own_name
 from pliant.service.problems import Refusal, from_validation, wrong_input
 from pliant.service.settings import ServiceSettings
@@ -349,7 +350,7 @@ def _priority(text: str) -> Priority:
     for each in get_args(Priority):
         if given == each:
             return each  # type: ignore[no-any-return]
-    code, names = ProblemCode.INVALID_PRIORITY, ", ".join(get_args(Priority))
+    code, names = ProblemCode.INVALID_PRIORITY, alternatives(get_args(Priority))
     raise wrong_input(code, field="priority", expected=names, got=repr(given[:40]), hint="Leave it out for normal.")
 
 
