@@ -157,7 +157,10 @@ def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept 
     try:
         job, file = jobs.kept_inputs(id, folder / "kept.npz")
     except UnknownJob as error:
-        raise Refusal(ProblemCode.UNKNOWN_JOB, detail=str(error), field=KEPT) from error
+        raise Refusal(
+            ProblemCode.UNKNOWN_JOB, detail=str(error), field=KEPT, expected="the id of one of your jobs", got=repr(id[:80]),
+            hint="List your jobs to see which exist; expired ones are removed.",
+        ) from error  # fmt: skip
     if is_source(file):
         source = open_source(file, folder / "kept")
         files = {

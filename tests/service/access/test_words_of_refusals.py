@@ -187,6 +187,27 @@ def test_rejected_requests_have_the_exact_message(http: httpx.Client, name: str)
     assert (answer.is_error, answer.json()["detail"]) == (True, words)
 
 
+@pytest.mark.parametrize(
+    ("method", "path", "parts", "headers", "code", "members"),
+    [
+        ("PUT", "/v1/jobs/done", {"tracks": TRACKS, "mesh": "3x4"}, {}, "id_taken",
+         ("id", "an id that no different job has", "'done'", "Choose another id.")),
+        ("POST", "/v1/jobs", {"tracks": TRACKS, "mesh": "3x4"}, {"Idempotency-Key": "mine"}, "idempotency_conflict",
+         ("Idempotency-Key", "a key that no different request has", "the key of the request that created job 'keyed'", "Use a new key.")),
+        ("POST", "/v1/jobs", {"inputs_of": "nobody"}, {}, "unknown_job",
+         ("inputs_of", "the id of one of your jobs", "'nobody'", "List your jobs to see which exist; expired ones are removed.")),
+    ],
+)  # fmt: skip
+def test_conflicts_and_unknown_jobs_name_the_field_and_what_was_sent(
+    http: httpx.Client, method: str, path: str, parts: Any, headers: dict[str, str], code: str, members: tuple[str, ...]
+) -> None:
+    own = {"Idempotency-Key": "mine"}
+    assert http.put("/v1/jobs/keyed", headers=own, **form(tracks=TRACKS, mesh="none")).is_success
+    problem = http.request(method, path, headers=headers, **form(**parts)).json()
+    assert problem["code"] == code
+    assert tuple(problem[name] for name in ("field", "expected", "got", "hint")) == members
+
+
 ERRORS: dict[str, tuple[Exception, str]] = {
     "too many queued": (errors.TooManyQueued(3), "Queue limit reached: 3 jobs are already queued. Submit again when one of them has started, or cancel one."),
     "too many uploads": (errors.TooManyUploads(5), "Upload limit reached: there are already 5 uploads. Delete some, or wait until they expire."),
