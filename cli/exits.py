@@ -107,6 +107,10 @@ def sentence_of(fault: BaseException, job: str | None = None, *, others: int = 0
     return str(fault) or type(fault).__name__
 
 
+OF_PYDANTIC = "Value error, "
+"""What pydantic writes before the message about an invalid choice."""
+
+
 class Guarded(TyperGroup):
     """Group of all commands, which turns errors into a message and an exit code."""
 
@@ -140,8 +144,11 @@ class Guarded(TyperGroup):
             fault: BaseException = caught
             if isinstance(fault, ModuleNotFoundError) and (fault.name or "").partition(".")[0] in SERVER_MODULES:
                 fault = MissingExtra(f"pliant {ctx.invoked_subcommand or ''}".strip())
+            fault = _of_setting(fault) or fault
             code = code_of(fault)
             if code is None:
+                if str(getattr(fault, "message", "")).startswith(OF_PYDANTIC):
+                    fault.message = fault.message.removeprefix(OF_PYDANTIC)  # type: ignore[attr-defined]
                 if hasattr(fault, "option_name") and hasattr(fault, "possibilities"):
                     _suggest(fault)
                 if not (as_json and hasattr(fault, "format_message")):
@@ -153,6 +160,32 @@ class Guarded(TyperGroup):
             sentence = sentence_of(fault, getattr(session, "following", None), others=getattr(session, "others", 0))
             show_fault(fault, sentence, code, as_json=as_json, url=getattr(session, "url", None))
             ctx.exit(code)
+
+
+def _of_setting(fault: Any) -> BaseException | None:
+    """Return the error of a setting whose environment variable was rejected as the value of an option; None for other errors.
+
+    So a variable leads to the same message, whichever process reads it.
+    """
+    parameter, context = getattr(fault, "param", None), getattr(fault, "ctx", None)
+    if parameter is None or context is None or os.environ.get(parameter.envvar or "", "") == "":
+        return None
+    source = context.get_parameter_source(parameter.name)
+    if source is None or source.name != "ENVIRONMENT":
+        return None
+    try:
+        from pliant.service.settings import ServiceSettings
+        from pliant.worker.settings import Settings
+    except ImportError:  # of a client without the extra
+        return None
+    from pliant.worker.errors import InvalidSetting
+
+    try:
+        Settings.from_environment()
+        ServiceSettings.from_environment()
+    except InvalidSetting as error:
+        return error
+    return None
 
 
 def _suggest(fault: Any) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from anyio import to_thread
+from pliant.schemas.option_faults import shown
 from pliant.schemas.problems import ProblemCode
 from pliant.service.problems import Refusal, wrong_input
 from python_multipart.exceptions import FormParserError
@@ -242,7 +243,7 @@ class _Reader:
                 ProblemCode.UNKNOWN_PART,
                 field=part.name[:80],
                 expected=expected,
-                got="a part of that name",
+                got=shown(part.name),
                 hint=rules.hint(part.name),
             )
         if part.name in self._files or part.name in self._texts:

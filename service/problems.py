@@ -138,7 +138,11 @@ def from_validation(errors: Sequence[Any], *, options: bool = False) -> Refusal:
         hint = f"{fault.hint} Compare with the schema at /v1/options.{others}".strip()
         code = ProblemCode(fault.code)
         return wrong_input(code, field=fault.field, expected=fault.expected, got=fault.got, hint=hint)
-    where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", "header")]
+    place, *inside = first["loc"] or ("request",)
+    if place in ("query", "path", "header"):  # what follows the name is a position that the client did not write
+        where = [str(part) for part in inside[:1]]
+    else:
+        where = [str(part) for part in first["loc"] if part != "body"]
     got = "nothing" if first["type"] == "missing" else shown(first.get("input"))
     return wrong_input(
         ProblemCode.INVALID_REQUEST, field=".".join(where) or "request", expected=expectation(first), got=got,

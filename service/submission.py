@@ -12,6 +12,7 @@ from pliant.schemas.job import LONGEST_NAME, Interpretation, Job, Priority
 from pliant.schemas.options import Options
 from pliant.schemas.problems import ProblemCode
 from pliant.schemas.suggestions import closest
+from pliant.schemas.validation import alternatives
 from pliant.service.multipart import File, Form, FormRules, own_name
 from pliant.service.problems import Refusal, from_validation, wrong_input
 from pliant.service.settings import ServiceSettings
@@ -156,7 +157,10 @@ def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept 
     try:
         job, file = jobs.kept_inputs(id, folder / "kept.npz")
     except UnknownJob as error:
-        raise Refusal(ProblemCode.UNKNOWN_JOB, detail=str(error), field=KEPT) from error
+        raise Refusal(
+            ProblemCode.UNKNOWN_JOB, detail=str(error), field=KEPT, expected="the id of one of your jobs", got=repr(id[:80]),
+            hint="List your jobs to see which exist; expired ones are removed.",
+        ) from error  # fmt: skip
     if is_source(file):
         source = open_source(file, folder / "kept")
         files = {
@@ -349,7 +353,7 @@ def _priority(text: str) -> Priority:
     for each in get_args(Priority):
         if given == each:
             return each  # type: ignore[no-any-return]
-    code, names = ProblemCode.INVALID_PRIORITY, ", ".join(get_args(Priority))
+    code, names = ProblemCode.INVALID_PRIORITY, alternatives(get_args(Priority))
     raise wrong_input(code, field="priority", expected=names, got=repr(given[:40]), hint="Leave it out for normal.")
 
 

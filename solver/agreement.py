@@ -6,11 +6,14 @@ Nothing here needs SciPy, so a reader can refuse a job before it is queued.
 from __future__ import annotations
 
 import numpy as np
-from pliant.solver.errors import InvalidInput, InvalidSettings, wrong_input
-from pliant.solver.limits import MAX_UNORDERED_FRAMES, frame_chunks
+from pliant.solver.errors import InvalidInput, InvalidSettings, shape_text, wrong_input
+from pliant.solver.limits import MAX_COORDINATE, MAX_UNORDERED_FRAMES, frame_chunks
 from pliant.solver.mesh import Mesh
-from pliant.solver.records import MIN_POINTS, Floats, KnownCamera, Tracks
+from pliant.solver.records import MIN_FRAMES, MIN_POINTS, Floats, KnownCamera, Tracks
 from pliant.solver.settings import Settings
+
+MAKE_TRACKS = "Use Tracks.from_arrays(points, visible), which validates and converts."
+MAKE_CAMERAS = "Use KnownCamera.from_arrays(rotations, scales), which validates and converts."
 
 MAX_CENTRE_RADII = 100.0
 """Maximum distance, along x and along y, of a principal point from the frames' centroids, RMS radii: a view of 1° or more."""
@@ -26,14 +29,23 @@ def check_agreement(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | No
     InvalidInput
         Number of vertices (code `mesh_mismatch`) or of cameras (`camera_mismatch`); cameras with a focal length while the settings have
         another one or an orthographic model (`camera_mismatch`); half or more of the observations outside `image_size`
-        (`outside_picture`); an argument of another type (`wrong_type`).
+        (`outside_picture`); an argument of another type (`wrong_type`); tracks or cameras that were not made with `from_arrays` and that it
+        would refuse or convert.
     InvalidSettings
         `laplacian="grid8"` with a mesh that is not a grid, `surface="isometric"` with given cameras, `camera="orthographic"` with given
         scales that are not 1, or `order="any"` with more than `MAX_UNORDERED_FRAMES` frames.
     """
-    _check_types(tracks, mesh, cameras, settings)
+    check_tracks(tracks)
+    for field, value, kind, make in (
+        ("mesh", mesh, Mesh, "Use Mesh.from_faces(faces, num_points)."),
+        ("cameras", cameras, KnownCamera, MAKE_CAMERAS),
+        ("settings", settings, Settings, "Use Settings(…)."),
+    ):
+        if value is not None:
+            check_type(field, value, kind, make)
     check_mesh(tracks, mesh, settings)
     if cameras is not None:
+        _check_known(cameras)
         _check_cameras(tracks, cameras, settings)
     if settings.order == "any" and tracks.num_frames > MAX_UNORDERED_FRAMES:
         raise InvalidSettings(
@@ -44,18 +56,61 @@ def check_agreement(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | No
         _check_picture(tracks, settings.image_size)
 
 
-def _check_types(tracks: object, mesh: object, cameras: object, settings: object) -> None:
-    """Refuse plain arrays with the function that makes the expected record of them."""
-    for field, value, kind, make in (
-        ("tracks", tracks, Tracks, "Tracks.from_arrays(points, visible)"),
-        ("mesh", mesh, Mesh, "Mesh.from_faces(faces, num_points)"),
-        ("cameras", cameras, KnownCamera, "KnownCamera.from_arrays(rotations)"),
-        ("settings", settings, Settings, "Settings(…)"),
-    ):
-        if not isinstance(value, kind) and (field == "tracks" or value is not None):
-            raise wrong_input(
-                field, "wrong_type", f"a {kind.__name__}", f"a value of type {type(value).__name__}", f"Use {make}."
-            )
+def check_type(field: str, value: object, kind: type, hint: str) -> None:
+    """Check that an argument is a record of the expected class; `hint` says how to make one.
+
+    Raises
+    ------
+    InvalidInput
+        Code `wrong_type`.
+    """
+    if not isinstance(value, kind):
+        raise wrong_input(field, "wrong_type", f"a {kind.__name__}", f"a value of type {type(value).__name__}", hint)
+
+
+def check_tracks(tracks: Tracks) -> None:
+    """Check that tracks are as `Tracks.from_arrays` makes them, because the class can also be called directly.
+
+    Raises
+    ------
+    InvalidInput
+        Not a `Tracks`, arrays of another type or shape, coordinates that are not finite or beyond ±1e12, or confidence outside [0, 1].
+    """
+    check_type("tracks", tracks, Tracks, MAKE_TRACKS)
+    points, visible = tracks.points, tracks.visible
+    _check_array("tracks", points, MAKE_TRACKS)
+    _check_array("visibility", visible, MAKE_TRACKS)
+    if points.ndim != 3 or points.shape[2] != 2 or len(points) < MIN_FRAMES or points.shape[1] < MIN_POINTS:
+        expected = f"(frames, points, 2) with at least {MIN_FRAMES} frames and {MIN_POINTS} points"
+        raise wrong_input("tracks", "wrong_shape", expected, shape_text(points), MAKE_TRACKS)
+    if visible.shape != points.shape[:2]:
+        raise wrong_input("visibility", "wrong_shape", str(points.shape[:2]), shape_text(visible), MAKE_TRACKS)
+    for some in frame_chunks(*visible.shape):
+        if not (np.abs(points[some]) <= MAX_COORDINATE).all():  # also rejects NaN
+            expected = f"finite coordinates within ±{MAX_COORDINATE:g}"
+            raise wrong_input("tracks", "out_of_range", expected, "others", MAKE_TRACKS)
+        if not ((visible[some] >= 0) & (visible[some] <= 1)).all():
+            raise wrong_input("visibility", "out_of_range", "values from 0 to 1", "others", MAKE_TRACKS)
+
+
+def _check_array(field: str, array: object, hint: str) -> None:
+    """Check that a member of a record is an array of float64."""
+    if not isinstance(array, np.ndarray) or array.dtype != np.float64:
+        got = f"dtype {array.dtype}" if isinstance(array, np.ndarray) else f"a value of type {type(array).__name__}"
+        raise wrong_input(field, "wrong_type", "an array of float64", got, hint)
+
+
+def _check_known(cameras: KnownCamera) -> None:
+    """Check that cameras are as `KnownCamera.from_arrays` makes them, because the class can also be called directly."""
+    valid = KnownCamera.from_arrays(
+        cameras.rotations, cameras.scales, focal=cameras.focal, principal_point=cameras.principal_point
+    )
+    _check_array("rotations", cameras.rotations, MAKE_CAMERAS)
+    if cameras.scales is not None:
+        _check_array("scales", cameras.scales, MAKE_CAMERAS)
+    if cameras.rotations.shape != valid.rotations.shape:
+        expected, got = shape_text(valid.rotations), shape_text(cameras.rotations)
+        raise wrong_input("rotations", "wrong_shape", expected, got, MAKE_CAMERAS)
 
 
 def check_mesh(tracks: Tracks, mesh: Mesh | None, settings: Settings) -> None:

@@ -61,7 +61,8 @@ def solve(
     Raises
     ------
     InvalidInput
-        Mesh or cameras do not fit the tracks, or the tracks have no extent or too few points that are visible in two frames.
+        Mesh or cameras do not fit the tracks, or the tracks have no extent or too few points that are visible in two frames. Tracks and
+        cameras that were made without `from_arrays` are validated, too.
     InvalidSettings
         The settings contradict the mesh, the cameras or the number of frames.
     NotFinite

@@ -28,7 +28,13 @@ def read_only(array: NDArray[np.generic]) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """Dense 2-D point tracks: the matrix W of Dai, Deng, He (2017), stored as points."""
+    """Dense 2-D point tracks: the image positions of P points in F frames. Make them with `from_arrays`, which validates and converts.
+
+    Both members are read-only arrays of float64 with the frames first and the points second: index p is the same point of the object in
+    every frame. Positions are `(x, y)` in any unit, usually pixels: x right, y down unless the settings have `y_up`. `visible` is the
+    confidence of each observation: 1 is certain, 0 hidden, and between them only the ratios count. They are the matrix W of Dai, Deng, He
+    (2017), stored as points.
+    """
 
     points: Floats
     """Image positions, shape `(F, P, 2)`, any unit, usually pixels; x right, y down unless the settings have `y_up`.
@@ -123,7 +129,7 @@ def projections_of(rotations: Floats, scales: Floats) -> Floats:
     return np.asarray(rotations[:, :2] * scales[:, None, None])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Camera:
     """Cameras of all frames; `project` maps shapes to the image."""
 
@@ -153,6 +159,10 @@ class Camera:
         """Make the arrays read-only."""
         for array in (self.rotations, self.scales, self.translations, self.principal_point):
             read_only(array)
+
+    def __repr__(self) -> str:
+        lens = "orthographic" if self.focal is None else f"focal length {self.focal:.4g}"
+        return f"<Camera of {len(self.rotations)} frames, {lens}>"
 
     def depths(self, shapes: Floats) -> Floats:
         """Return z = ± s_f R_f[2] x, the depth behind each frame's origin in image units, shape `(F, P)`; minus if `y_up`."""

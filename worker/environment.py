@@ -11,6 +11,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
+from pliant.schemas.validation import alternatives
 from pliant.worker.errors import InvalidSetting
 from pydantic import BaseModel, ValidationError, create_model, model_validator
 from pydantic.dataclasses import is_pydantic_dataclass
@@ -45,7 +46,7 @@ def expected_of(field: FieldInfo) -> str:
         return field.description
     kinds = [kind for kind in get_args(field.annotation) if kind is not type(None)] or [field.annotation]
     if get_origin(field.annotation) is Literal:
-        return f"{', '.join(map(repr, kinds[:-1]))} or {kinds[-1]!r}"
+        return alternatives(map(repr, kinds))
     bounds = [
         f", {word} {getattr(each, sign)}" for each in field.metadata for sign, word in _BOUNDS.items() if hasattr(each, sign)
     ]  # fmt: skip

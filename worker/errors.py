@@ -95,12 +95,23 @@ class NotAllowedNow(WorkerError):
 
 
 class Conflict(WorkerError):
-    """An id or an idempotency key is already used for a different request."""
+    """An id or an idempotency key is already used for a different request, or an upload is in another state."""
 
     def __init__(self, code: str, *, id: str, sentence: str) -> None:
         super().__init__(sentence)
         self.code = code
         self.id = id
+
+
+class Taken(Conflict):
+    """An id or an idempotency key is already used for a different request; `id` is the job that has it."""
+
+    def __init__(self, code: str, *, id: str, field: str, expected: str, got: str, sentence: str, hint: str) -> None:
+        super().__init__(code, id=id, sentence=f"{sentence} {hint}")
+        self.field = field
+        self.expected = expected
+        self.got = got
+        self.hint = hint
 
 
 class OffsetMismatch(Invalid, Conflict):

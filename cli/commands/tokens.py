@@ -170,11 +170,12 @@ def scopes_of(words: list[str]) -> list[Any]:
         A word is not a scope.
     """
     from pliant.client.errors import BadArgument
+    from pliant.schemas.validation import alternatives
     from pliant.worker.tokens import Scope
 
     unknown = [word for word in words if word not in set(Scope)]
     if unknown:
-        raise BadArgument(f"--scope: expected {', '.join(Scope)}, got {unknown[0]!r}.")
+        raise BadArgument(f"--scope: expected {alternatives(Scope)}, got {unknown[0]!r}.")
     return [Scope(word) for word in words]
 
 

@@ -14,7 +14,7 @@ import base64
 import re
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Literal
 
 import anyio
 from anyio import to_thread
@@ -46,7 +46,7 @@ Offset = Annotated[
     ),
 ]
 Complete = Annotated[
-    str, Header(alias="Upload-Complete", pattern=r"^\?[01]$", description="`?0` if more follows; `?1` is the default.")
+    Literal["?1", "?0"], Header(alias="Upload-Complete", description="`?0` if more follows; `?1` is the default.")
 ]
 Length = Annotated[
     int | None, Header(alias="Upload-Length", ge=0, le=ANY, description="Bytes of the whole upload, if known.")

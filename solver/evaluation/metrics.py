@@ -31,6 +31,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pliant.solver.agreement import check_type
 from pliant.solver.errors import InvalidInput
 from pliant.solver.evaluation.alignment import Aligned, Kind, align
 from pliant.solver.limits import frame_chunks
@@ -199,8 +200,9 @@ def evaluate(
     Raises
     ------
     InvalidInput
-        Ground truth of the wrong shape, not finite, or without extent.
+        Ground truth of the wrong shape, not finite, or without extent; `tracks` is not a `Tracks`.
     """
+    check_type("tracks", tracks, Tracks, "Pass the input of the solve: evaluate(solution, tracks, truth).")
     fit = reprojection(tracks, solution)
     values = {"reprojection_median": fit.median, "reprojection_rms": fit.rms}
     if truth is not None:

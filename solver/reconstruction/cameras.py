@@ -100,7 +100,7 @@ def estimate_cameras(
     Raises
     ------
     InvalidInput
-        The given cameras do not match the tracks, or too few observations are visible.
+        The given cameras do not match the tracks, too few observations are visible, or tracks or cameras are no valid records.
     InvalidSettings
         Settings and tracks contradict each other.
     """

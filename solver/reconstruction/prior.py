@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from pliant.solver.agreement import check_tracks
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.energy.hyperparameters import noise_std
@@ -107,8 +108,9 @@ def learn_prior(
     Raises
     ------
     InvalidInput
-        The cameras were estimated from other tracks.
+        The cameras were estimated from other tracks, or these are no valid `Tracks`.
     """
+    check_tracks(tracks)
     given = cameras.observations.tracks
     if given is not tracks and not (
         np.array_equal(given.points, tracks.points) and np.array_equal(given.visible, tracks.visible)

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from pliant.solver.agreement import check_mesh
+from pliant.solver.agreement import check_mesh, check_tracks
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import ShouldStop, pulses_to
@@ -62,7 +62,7 @@ def solve_shapes(
     Raises
     ------
     InvalidInput
-        Mesh, cameras, prior or start do not match the tracks.
+        Mesh, cameras, prior or start do not match the tracks, or these are no valid `Tracks`.
     InvalidSettings
         The settings select another prior than the given one, or require a mesh that is a grid.
     NotFinite
@@ -70,6 +70,7 @@ def solve_shapes(
     OSError
         The folder `scratch` is missing, cannot be written to, or has too little space.
     """
+    check_tracks(tracks)
     observations = cameras.observations.of(tracks)
     first = None if start is None else np.asarray(start.shapes if isinstance(start, Solution) else start, dtype=float)
     if first is not None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.agreement import check_mesh
+from pliant.solver.agreement import check_mesh, check_tracks
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import orthographic
 from pliant.solver.energy.problem import Problem
@@ -106,7 +106,15 @@ def find_outliers(
     -------
     ndarray of bool, shape (F, P)
         All False if the estimated share of outliers, `cameras.outlier_share`, is 0.5 % or less.
+
+    Raises
+    ------
+    InvalidInput
+        Mesh, cameras or prior do not match the tracks, or these are no valid `Tracks`.
+    InvalidSettings
+        The settings select another prior than the given one.
     """
+    check_tracks(tracks)
     used = cameras.observations.settings if settings is None else settings
     monitor = monitored(tracks, None, used, on_step, should_stop, only=("shapes",))
     with pulses_to(monitor.pulse):

@@ -19,6 +19,7 @@ import pytest
 import redis
 from pliant.cli import app
 from pliant.cli.demo import GOOD, judge, read_address, why
+from pliant.cli.exits import Exit
 from pliant.cli.session import Session, name_of, parse_options
 from pliant.cli.solve import file_or_word
 from pliant.client import BadArgument, Unreachable
@@ -308,6 +309,34 @@ def test_doctor_and_fsck_read_env_and_secret_files_as_the_service_does(
     assert findings["blobs"] == f"{(tmp_path / 'bucket').as_uri()} answers"
     assert found("doctor", "--data", "here")["storage"].startswith(f"{tmp_path / 'here'}, ")
     assert "job store" in found("fsck")["stored"], "the directory is an installation, whose queue is not running"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("PLIANT_AUTH", "on", "'auto', 'required' or 'off'"),
+        ("PLIANT_PORT", "abc", "a whole number, at least 0, at most 65535"),
+        ("PLIANT_WORKERS", "0", "a whole number, at least 1"),
+    ],
+)
+def test_a_setting_that_is_also_an_option_is_refused_like_every_setting(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: str, expected: str
+) -> None:
+    monkeypatch.setenv(name, value)
+    ran = CliRunner().invoke(app, ["up", "--json"], obj=Session())
+    words = f"{name}: expected {expected}, got {value!r}. Correct the variable or leave it unset."
+    assert (ran.exit_code, json.loads(ran.stderr)["detail"]) == (Exit.REFUSED, words)
+
+
+@pytest.mark.parametrize("missing", [True, False])
+def test_a_wrong_option_is_a_usage_error(monkeypatch: pytest.MonkeyPatch, *, missing: bool) -> None:
+    if missing:  # without the extra, the variable is reported as the value of the option
+        monkeypatch.setitem(sys.modules, "pliant.service.settings", None)
+        monkeypatch.setenv("PLIANT_AUTH", "on")
+    ran = CliRunner().invoke(app, ["up", "--json", *([] if missing else ["--auth", "on"])], obj=Session())
+    assert ran.exit_code == Exit.USAGE
+    assert json.loads(ran.stderr)["detail"].endswith("'on' is not one of 'auto', 'required', 'off'.")
+    assert "Value error" not in ran.stderr
 
 
 def test_doctor_checks_the_service() -> None:

@@ -389,7 +389,7 @@ def test_commands_reject_a_missing_installation_and_create_nothing(
 def test_an_unknown_scope_is_refused_before_the_installation_is_opened(run: Run, tmp_path: Path) -> None:
     ran = run("token", "create", "ada", "--scope", "root", "--data", str(tmp_path / "data"))
     assert ran.exit_code == Exit.REFUSED
-    assert words(ran) == refusal("--scope: expected read, submit, admin, got 'root'.")
+    assert words(ran) == refusal("--scope: expected read, submit or admin, got 'root'.")
     assert not (tmp_path / "data").exists()
 
 

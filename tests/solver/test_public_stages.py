@@ -104,6 +104,8 @@ def test_reprs_are_short(cameras: Cameras, prior: Prior, solution: Solution) -> 
     assert repr(cameras) == "<Cameras of 8 frames, orthographic>"
     assert repr(prior).startswith("<Prior of 8 frames: ")
     assert repr(solution).startswith(f"<Solution of 8 frames × {MADE.tracks.num_points} points, converged")
+    assert repr(solution.camera) == "<Camera of 8 frames, orthographic>"
+    assert repr(replace(solution.camera, focal=912.34)) == "<Camera of 8 frames, focal length 912.3>"
     assert all(len(repr(each)) < 90 for each in (cameras, prior, solution))
 
 
@@ -290,3 +292,16 @@ def test_the_most_confident_observation_counts_as_one() -> None:
     shown = observations.without(surer.visible == 1.0)
     assert shown.normalized.visible.max() == 1.0
     assert shown.with_all().normalized.visible.max() == 1.0
+
+
+@pytest.mark.parametrize("wrong", [Tracks(MADE.tracks.points.astype(int), MADE.tracks.visible), MADE.tracks.points])
+def test_every_stage_refuses_tracks_made_without_validation(wrong: Tracks, cameras: Cameras, prior: Prior) -> None:
+    for stage, more in (
+        (estimate_cameras, ()),
+        (learn_prior, (cameras,)),
+        (find_outliers, (cameras, prior)),
+        (solve_shapes, (cameras, prior)),
+    ):
+        with pytest.raises(InvalidInput, match=r"Tracks\.from_arrays") as caught:
+            stage(wrong, *more)  # type: ignore[operator]
+        assert (caught.value.code, caught.value.field) == ("wrong_type", "tracks")

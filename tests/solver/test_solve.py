@@ -16,6 +16,7 @@ from pliant.solver import (
     Settings,
     Step,
     Tracks,
+    estimate_cameras,
     gallery,
     solve,
 )
@@ -146,3 +147,56 @@ def test_plain_arrays_are_refused_with_the_record_to_make(field: str, more: dict
     with pytest.raises(InvalidInput, match=make.replace("(", r"\(")) as caught:
         solve(**given)
     assert (caught.value.code, caught.value.field) == ("wrong_type", field)
+
+
+TRACKS = gallery.face(5, 30).tracks
+FACING = np.tile(np.eye(3), (5, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("points", "visible", "field", "code"),
+    [
+        (TRACKS.points.astype(int), TRACKS.visible, "tracks", "wrong_type"),
+        (TRACKS.points.astype(np.float32), TRACKS.visible, "tracks", "wrong_type"),
+        (TRACKS.points.tolist(), TRACKS.visible, "tracks", "wrong_type"),
+        (TRACKS.points, TRACKS.visible > 0, "visibility", "wrong_type"),
+        (TRACKS.points[0], TRACKS.visible, "tracks", "wrong_shape"),
+        (TRACKS.points[..., :1], TRACKS.visible, "tracks", "wrong_shape"),
+        (TRACKS.points[:2], TRACKS.visible[:2], "tracks", "wrong_shape"),
+        (TRACKS.points[:, :3], TRACKS.visible[:, :3], "tracks", "wrong_shape"),
+        (TRACKS.points, TRACKS.visible[:, 1:], "visibility", "wrong_shape"),
+        (np.where(TRACKS.points == TRACKS.points[1, 2], np.nan, TRACKS.points), TRACKS.visible, "tracks", "out_of_range"),
+        (TRACKS.points + 2e12, TRACKS.visible, "tracks", "out_of_range"),
+        (TRACKS.points, 2 * TRACKS.visible, "visibility", "out_of_range"),
+        (TRACKS.points, -TRACKS.visible, "visibility", "out_of_range"),
+        (TRACKS.points, np.nan * TRACKS.visible, "visibility", "out_of_range"),
+    ],
+)  # fmt: skip
+def test_tracks_made_without_validation_are_refused(points: Any, visible: Any, field: str, code: str) -> None:
+    with pytest.raises(InvalidInput, match=r"Tracks\.from_arrays") as caught:
+        solve(Tracks(points, visible), settings=Settings(method="temporal", prior="smooth"))
+    assert (caught.value.code, caught.value.field) == (code, field)
+
+
+@pytest.mark.parametrize(
+    ("members", "field", "code"),
+    [
+        ({"rotations": np.ones((5, 3, 3))}, "rotations", "not_a_rotation"),
+        ({"rotations": FACING[:, :2]}, "rotations", "wrong_shape"),
+        ({"rotations": FACING.astype(int)}, "rotations", "wrong_type"),
+        ({"rotations": FACING.tolist()}, "rotations", "wrong_type"),
+        ({"rotations": FACING, "scales": np.ones(4)}, "scales", "wrong_shape"),
+        ({"rotations": FACING, "scales": -np.ones(5)}, "scales", "out_of_range"),
+        ({"rotations": FACING, "scales": [1.0] * 5}, "scales", "wrong_type"),
+        ({"rotations": FACING, "focal": -9.0}, "cameras.focal", "out_of_range"),
+        ({"rotations": FACING, "principal_point": (np.nan, 0.0)}, "cameras.principal_point", "not_finite"),
+    ],
+)
+@pytest.mark.parametrize("stage", [solve, estimate_cameras])
+def test_cameras_made_without_validation_are_refused(
+    stage: Any, members: dict[str, Any], field: str, code: str
+) -> None:
+    known = KnownCamera(**members)
+    with pytest.raises(InvalidInput) as caught:
+        stage(TRACKS, **{"cameras" if stage is solve else "known": known})
+    assert (caught.value.code, caught.value.field) == (code, field)

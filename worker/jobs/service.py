@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pliant.schemas.job import Artifact, Interpretation, Job, JobPage, Status
 from pliant.worker import tracing
-from pliant.worker.errors import Conflict, NotAllowedNow, StoreUnavailable, TooManyQueued, UnknownArtifact, UnknownJob
+from pliant.worker.errors import NotAllowedNow, StoreUnavailable, Taken, TooManyQueued, UnknownArtifact, UnknownJob
 from pliant.worker.ids import check_id, is_id, new_attempt_id, new_job_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.admission import check_fits
@@ -347,12 +347,15 @@ class Jobs:
             return self._placed(found)
         wanted = wanted or submission.id
         if found.job.id == wanted:
-            sentence = f"The id {wanted!r} is already used by a different job. Choose another id."
-            raise Conflict("id_taken", id=wanted, sentence=sentence)
-        sentence = (
-            f"This Idempotency-Key was used for a different request, which created job {found.job.id!r}. Use a new key."
-        )
-        raise Conflict("idempotency_conflict", id=found.job.id, sentence=sentence)
+            raise Taken(
+                "id_taken", id=wanted, field="id", expected="an id that no different job has", got=repr(wanted),
+                sentence=f"The id {wanted!r} is already used by a different job.", hint="Choose another id.",
+            )  # fmt: skip
+        raise Taken(
+            "idempotency_conflict", id=found.job.id, field="Idempotency-Key", expected="a key that no different request has",
+            got=f"the key of the request that created job {found.job.id!r}",
+            sentence=f"This Idempotency-Key was used for a different request, which created job {found.job.id!r}.", hint="Use a new key.",
+        )  # fmt: skip
 
     def _placed(self, stored: Stored) -> Job:
         if stored.job.status is not Status.QUEUED:

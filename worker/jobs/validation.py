@@ -28,8 +28,9 @@ def check_page(cursor: str | None, limit: int) -> None:
     """Check that a cursor is one that `Jobs.page` returned, and that a limit is in range."""
     if not 1 <= limit <= LARGEST_PAGE:
         raise InvalidRequest(
-            "invalid_limit", field="limit", expected=f"1–{LARGEST_PAGE}", got=str(limit), hint="Request fewer at once."
-        )
+            "invalid_limit", field="limit", expected=f"1–{LARGEST_PAGE}", got=str(limit),
+            hint="Request a page of that many; `next` continues with the following one.",
+        )  # fmt: skip
     if cursor is not None and not _CURSOR.fullmatch(cursor):
         raise InvalidRequest(
             "invalid_cursor", field="cursor", expected="`next` of an earlier page", got=repr(cursor)[:80],

@@ -55,7 +55,7 @@ def prepare(service: InMemoryService, client: httpx.Client) -> None:
 
 PART = (
     "{}: expected one of film, film_upload, ground_truth, ground_truth_upload, inputs_of, mesh, mesh_upload, name, options, priority, region, "
-    "region_upload, rotations, rotations_upload, tracks, tracks_upload, webhook, webhook_secret, got a part of that name. "
+    "region_upload, rotations, rotations_upload, tracks, tracks_upload, webhook, webhook_secret, got {!r}. "
 )
 
 REQUESTS: dict[str, tuple[Request, str]] = {
@@ -78,11 +78,11 @@ REQUESTS: dict[str, tuple[Request, str]] = {
     "kept inputs of no job": (("POST", "/v1/jobs", form(inputs_of="nobody")),
         "There is no job 'nobody'. List your jobs to see which exist; expired ones are removed."),
     "an unknown part": (("POST", "/v1/jobs", form(track=TRACKS)),
-        PART.format("track") + "Did you mean tracks? If not, leave it out."),
-    "an option as a part": (("POST", "/v1/jobs", form(loss="huber")), PART.format("loss") + 'It is an option: send it in the part options, as in curl\'s -F \'options={"loss": …}\'.'),
-    "a file as file": (("POST", "/v1/jobs", form(file=TRACKS)), PART.format("file") + "Name the part tracks or film, as in curl's -F tracks=@tracks.npz or -F film=@film.mp4."),
-    "a mask": (("POST", "/v1/jobs", form(mask=FILM)), PART.format("mask") + "Did you mean region? If not, leave it out."),
-    "a part like no other": (("POST", "/v1/jobs", form(qwerty="1")), PART.format("qwerty") + "Leave it out."),
+        PART.format("track", "track") + "Did you mean tracks? If not, leave it out."),
+    "an option as a part": (("POST", "/v1/jobs", form(loss="huber")), PART.format("loss", "loss") + 'It is an option: send it in the part options, as in curl\'s -F \'options={"loss": …}\'.'),
+    "a file as file": (("POST", "/v1/jobs", form(file=TRACKS)), PART.format("file", "file") + "Name the part tracks or film, as in curl's -F tracks=@tracks.npz or -F film=@film.mp4."),
+    "a mask": (("POST", "/v1/jobs", form(mask=FILM)), PART.format("mask", "mask") + "Did you mean region? If not, leave it out."),
+    "a part like no other": (("POST", "/v1/jobs", form(qwerty="1")), PART.format("qwerty", "qwerty") + "Leave it out."),
     "a MATLAB file as the film": (("POST", "/v1/jobs", form(film=("tracks.mat", b"MATLAB 5.0" + bytes(600)))),
         "film: expected an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures, got tracks.mat, a file of tracks. Send it as the tracks instead (on the page: under Tracks; REST: -F tracks=@tracks.npz; Python: submit('tracks.npz'); command line: pliant solve tracks.npz)."),
     "tracks as text": (("POST", "/v1/jobs", form(tracks="1,2,3")),
@@ -103,6 +103,8 @@ REQUESTS: dict[str, tuple[Request, str]] = {
         "Content-Encoding: expected a body that is not compressed, got gzip. Send it as it is; npz files and films are compressed already."),
     "a compressed upload": (("PUT", "/v1/uploads/packed", {"content": b"abc", "headers": {"Content-Encoding": "br"}}),
         "Content-Encoding: expected a body that is not compressed, got br. Send it as it is; npz files and films are compressed already."),
+    "an upload whose end is a word": (("PUT", "/v1/uploads/ended", {"content": b"abc", "headers": {"Upload-Complete": "yes"}}),
+        "Upload-Complete: expected '?1' or '?0', got 'yes'. Compare with the schema at /docs."),
     "an appended upload without an offset": (("PATCH", "/v1/uploads/part", {"content": b"c"}),
         "Upload-Offset: expected a value, got nothing. Compare with the schema at /docs."),
     "an unknown option": (("POST", "/v1/jobs", form(tracks=TRACKS, options='{"los": "l1"}')),
@@ -110,7 +112,7 @@ REQUESTS: dict[str, tuple[Request, str]] = {
     "an option of another value": (("POST", "/v1/jobs", form(tracks=TRACKS, options='{"loss": "l3"}')),
         "options.loss: expected 'l1', 'l2' or 'huber', got 'l3'. Compare with the schema at /v1/options."),
     "an option beyond its bounds": (("POST", "/v1/jobs", form(tracks=TRACKS, options='{"fps": 0}')),
-        "options.fps: expected greater than 0, got 0. Compare with the schema at /v1/options."),
+        "options.fps: expected more than 0, got 0. Compare with the schema at /v1/options."),
     "an option of another form": (("POST", "/v1/jobs", form(tracks=TRACKS, options='{"image_size": "wide"}')),
         "options.image_size: expected width and height in pixels, such as 1920x1080, got 'wide'. Compare with the schema at /v1/options."),
     "frames of another form": (("POST", "/v1/jobs", form(tracks=TRACKS, options='{"frames": "10-20"}')),
@@ -118,7 +120,7 @@ REQUESTS: dict[str, tuple[Request, str]] = {
     "a point of another form": (("POST", "/v1/jobs", form(tracks=TRACKS, options='{"principal_point": "320"}')),
         "options.principal_point: expected x,y in pixels, such as 319.5,239.5, got '320'. Compare with the schema at /v1/options."),
     "an unknown priority": (("POST", "/v1/jobs", form(tracks=TRACKS, priority="urgent")),
-        "priority: expected high, normal, low, got 'urgent'. Leave it out for normal."),
+        "priority: expected high, normal or low, got 'urgent'. Leave it out for normal."),
     "a long name": (("POST", "/v1/jobs", form(tracks=TRACKS, name="a" * 201)),
         "name: expected at most 200 characters, got 201. Shorten it."),
     "an id of two letters": (("PUT", "/v1/jobs/ab", form(tracks=TRACKS)),
@@ -144,7 +146,7 @@ REQUESTS: dict[str, tuple[Request, str]] = {
     "sharing a running job": (("POST", "/v1/jobs/running/shares", {"json": {}}),
         "Job 'running' has the status running: it cannot be shared now. Wait until it has succeeded."),
     "sharing for a second": (("POST", "/v1/jobs/done/shares", {"json": {"expires_in": 1}}),
-        "expires_in: expected greater than or equal to 60, got 1. Compare with the schema at /docs."),
+        "expires_in: expected at least 60, got 1. Compare with the schema at /docs."),
     "a share that there is not": (("DELETE", "/v1/jobs/done/shares/nothing", {}),
         "Job 'done' has no share link 'nothing'; it may have expired. List the links to see which there are."),
     "outputs of a running job": (("POST", "/v1/jobs/running/outputs", {"json": {"outputs": ["glb"]}}),
@@ -154,11 +156,13 @@ REQUESTS: dict[str, tuple[Request, str]] = {
     "no outputs": (("POST", "/v1/jobs/done/outputs", {"json": {"outputs": []}}),
         "outputs: expected at least 1 item, got []. Compare with the schema at /docs."),
     "too many jobs on a page": (("GET", "/v1/jobs?limit=1000", {}),
-        "limit: expected 1–200, got 1000. Request fewer at once."),
+        "limit: expected 1–200, got 1000. Request a page of that many; `next` continues with the following one."),
+    "no jobs on a page": (("GET", "/v1/jobs?limit=0", {}),
+        "limit: expected 1–200, got 0. Request a page of that many; `next` continues with the following one."),
     "a cursor that is none": (("GET", "/v1/jobs?cursor=abc", {}),
         "cursor: expected `next` of an earlier page, got 'abc'. Start again without a cursor."),
     "an unknown status": (("GET", "/v1/jobs?status=done", {}),
-        "status.0: expected 'queued', 'running', 'cancelling', 'succeeded', 'failed' or 'cancelled', got 'done'. Compare with the schema at /docs."),
+        "status: expected 'queued', 'running', 'cancelling', 'succeeded', 'failed' or 'cancelled', got 'done'. Compare with the schema at /docs."),
     "an event that is none": (("GET", "/v1/jobs/running/events", {"headers": {"Last-Event-ID": "abc"}}),
         "Last-Event-ID: expected the id of an event, got 'abc'. Omit it to get all events that are kept."),
     "a long idempotency key": (("POST", "/v1/jobs", {**form(tracks=TRACKS), "headers": {"Idempotency-Key": "a" * 256}}),
@@ -181,6 +185,27 @@ def test_rejected_requests_have_the_exact_message(http: httpx.Client, name: str)
     (method, path, more), words = REQUESTS[name]
     answer = http.request(method, path, **more)
     assert (answer.is_error, answer.json()["detail"]) == (True, words)
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "parts", "headers", "code", "members"),
+    [
+        ("PUT", "/v1/jobs/done", {"tracks": TRACKS, "mesh": "3x4"}, {}, "id_taken",
+         ("id", "an id that no different job has", "'done'", "Choose another id.")),
+        ("POST", "/v1/jobs", {"tracks": TRACKS, "mesh": "3x4"}, {"Idempotency-Key": "mine"}, "idempotency_conflict",
+         ("Idempotency-Key", "a key that no different request has", "the key of the request that created job 'keyed'", "Use a new key.")),
+        ("POST", "/v1/jobs", {"inputs_of": "nobody"}, {}, "unknown_job",
+         ("inputs_of", "the id of one of your jobs", "'nobody'", "List your jobs to see which exist; expired ones are removed.")),
+    ],
+)  # fmt: skip
+def test_conflicts_and_unknown_jobs_name_the_field_and_what_was_sent(
+    http: httpx.Client, method: str, path: str, parts: Any, headers: dict[str, str], code: str, members: tuple[str, ...]
+) -> None:
+    own = {"Idempotency-Key": "mine"}
+    assert http.put("/v1/jobs/keyed", headers=own, **form(tracks=TRACKS, mesh="none")).is_success
+    problem = http.request(method, path, headers=headers, **form(**parts)).json()
+    assert problem["code"] == code
+    assert tuple(problem[name] for name in ("field", "expected", "got", "hint")) == members
 
 
 ERRORS: dict[str, tuple[Exception, str]] = {

@@ -178,6 +178,14 @@ def test_evaluate_names_what_the_inputs_allow():
     assert off["reprojection_rms"] == pytest.approx(0.1 * np.sqrt(2), rel=0.2)
 
 
+def test_evaluate_without_tracks_is_refused_in_words():
+    with pytest.raises(
+        InvalidInput, match=r"tracks: expected a Tracks, .*evaluate\(solution, tracks, truth\)"
+    ) as caught:
+        evaluate(solution_of(TRUTH), TRUTH)
+    assert caught.value.code == "wrong_type"
+
+
 def test_a_truth_in_another_unit_shows_in_the_size_ratio_and_not_in_the_scaled_error():
     found = evaluate(solution_of(TRUTH), Tracks.from_arrays(TRUTH[..., :2]), TRUTH / 1000)
     assert found["size_ratio"] == pytest.approx(1e-3)
