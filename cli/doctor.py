@@ -66,6 +66,7 @@ def doctor(
         *check_packages(),
         *check_blas(),
         *check_cores(),
+        *check_memory(),
         *check_storage(data or settings_here().data),
         *check_valkey(),
         *check_blobs(),
@@ -193,6 +194,22 @@ def check_cores() -> Iterator[Finding]:
         yield Finding("cores", "note", found, "More threads than cores: lower PLIANT_WORKERS or PLIANT_THREADS.")
     else:
         yield Finding("cores", "good", found)
+
+
+def check_memory() -> Iterator[Finding]:
+    """Check that the workers fit into the memory."""
+    from pliant.worker.errors import InvalidSetting
+    from pliant.worker.processes.memory import check_workers, memory_there
+
+    settings = settings_here()
+    try:
+        check_workers(settings)
+    except InvalidSetting as fault:
+        yield Finding("memory", "bad", str(fault), "`pliant up` would not start: lower PLIANT_WORKERS.")
+        return
+    there = memory_there()
+    if there > 0:
+        yield Finding("memory", "good", f"{there / 1e9:.1f} GB for {settings.workers} worker(s)")
 
 
 def check_storage(data: Path) -> Iterator[Finding]:

@@ -1,0 +1,55 @@
+"""`pliant up` and `pliant work` with settings that cannot work: they end before a process is started."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from pliant.cli import app
+from pliant.cli.doctor import check_memory
+from pliant.cli.exits import Exit
+from pliant.worker.processes import memory
+from pliant.worker.processes.supervisor import Supervisor
+from typer.testing import CliRunner, Result
+
+Run = Callable[..., Result]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Run a command with some variables of Pliant and no others, in an empty folder and without starting processes."""
+    for name in [name for name in os.environ if name.startswith("PLIANT_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "400")
+
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("processes would be started")
+
+    monkeypatch.setattr(Supervisor, "run", never)
+
+    def run(*arguments: str, **variables: str) -> Result:
+        for name, value in variables.items():
+            monkeypatch.setenv(name, value)
+        return CliRunner().invoke(app, arguments)
+
+    return run
+
+
+@pytest.mark.parametrize("command", ["up", "work"])
+def test_more_workers_than_fit_into_the_memory_are_refused(
+    run: Run, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    monkeypatch.setattr(memory, "_physical", lambda: 1 << 30)
+    monkeypatch.setattr(memory, "group_files", lambda name: [])
+    (finding,) = check_memory()
+    assert (finding.verdict, finding.found) == ("good", "1.1 GB for 1 worker(s)")
+    for result in (run(command, "--workers", "10000"), run(command, PLIANT_WORKERS="10000")):
+        assert result.exit_code == Exit.REFUSED
+        assert "PLIANT_WORKERS: expected at most 14, " in result.output
+        assert "got 10000. Lower it" in result.output
+    (finding,) = check_memory()
+    assert finding.verdict == "bad"
+    assert "got 10000" in finding.found
