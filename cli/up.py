@@ -76,12 +76,12 @@ def up(
     ctx.obj.json = as_json
     require_server("pliant up")
     from pliant.service.settings import ServiceSettings
-    from pliant.worker.processes.memory import check_workers
+    from pliant.worker.processes.preflight import check_settings
     from pliant.worker.processes.supervisor import Supervisor, valkey_child, worker_children
     from pliant.worker.processes.valkey import Valkey
 
     settings, service = read_settings(data, workers), ServiceSettings.from_environment()
-    check_workers(settings)
+    check_settings(settings)
     host = service.host if host is None else host
     port = free_port(host, service.port if port is None else port)
     url = address(host, port)
@@ -117,11 +117,11 @@ def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json
     """Run only workers, for a service that uses the same PLIANT_REDIS_URL and PLIANT_BLOB_URL."""
     ctx.obj.json = as_json
     require_server("pliant work")
-    from pliant.worker.processes.memory import check_workers
+    from pliant.worker.processes.preflight import check_settings
     from pliant.worker.processes.supervisor import Supervisor, worker_children
 
     settings = read_settings(data, workers)
-    check_workers(settings)
+    check_settings(settings)
     make_folder(settings.data, "--data")
 
     def announce() -> None:

@@ -53,3 +53,23 @@ def test_more_workers_than_fit_into_the_memory_are_refused(
     (finding,) = check_memory()
     assert finding.verdict == "bad"
     assert "got 10000" in finding.found
+
+
+@pytest.mark.parametrize("command", ["up", "work"])
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("REDIS_URL", "http://:secret@host", "a URL redis://, rediss:// or unix://, got another text"),
+        ("REDIS_URL", "redis://host:99999", "a URL redis://, rediss:// or unix://, got another text"),
+        ("BLOB_URL", "/srv/blobs", "file:///FOLDER or s3://BUCKET/PREFIX, got '/srv/blobs'"),
+        ("BLOB_URL", "file:///dev/null/blobs", "a folder that exists or can be made, got 'file:///dev/null/blobs'"),
+    ],
+)
+def test_an_invalid_url_of_a_store_is_reported_once_as_an_invalid_setting(
+    run: Run, command: str, name: str, value: str, expected: str
+) -> None:
+    result = run(command, "--json", **{f"PLIANT_{name}": value})
+    assert result.exit_code == Exit.REFUSED
+    assert result.output.count(f"PLIANT_{name}: expected {expected}") == 1
+    assert "invalid_setting" in result.output
+    assert "secret" not in result.output
