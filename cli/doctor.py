@@ -338,22 +338,18 @@ def check_blobs() -> Iterator[Finding]:
 
 def _redis(address: str) -> Finding:
     """Check that the server accepts the credentials of the address, and that it does not evict keys."""
-    from urllib.parse import urlsplit
-
-    parts = urlsplit(address)
-    where = (
-        f"{parts.scheme}://{parts.hostname}:{parts.port or 6379}"
-        if parts.hostname
-        else f"{parts.scheme}://{parts.path}"
-    )
     advice = "Start that server, or unset PLIANT_REDIS_URL to use the embedded one."
-    from pliant.worker.errors import WorkerError
+    from pliant.worker.errors import InvalidSetting, StoreUnavailable
     from pliant.worker.store.connection import check_server
+    from pliant.worker.store.outage import address_of
 
     try:
         policy = check_server(address)
-    except WorkerError as fault:
-        return Finding("queue", "bad", f"{where}: {fault}", advice)
+    except InvalidSetting as fault:
+        return Finding("queue", "bad", str(fault), "Correct the address.")
+    except StoreUnavailable as fault:
+        return Finding("queue", "bad", f"{address_of(address)}: {fault}", advice)
+    where = address_of(address)
     if policy not in ("noeviction", ""):
         remedy = "Set maxmemory-policy to noeviction: a server that evicts keys loses jobs."
         return Finding("queue", "bad", f"{where} has maxmemory-policy {policy}", remedy)

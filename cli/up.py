@@ -94,7 +94,8 @@ def up(
             children.append(valkey_child(valkey))
         children += [*worker_children(settings), service_child(settings, host, port, url, auth=auth or service.auth)]
 
-        Supervisor(children).run(on_started=lambda: _announce(url, settings, as_json=as_json))
+        if await_store(settings, within=READY_WITHIN):
+            Supervisor(children).run(on_started=lambda: _announce(url, settings, as_json=as_json))
     if not as_json:
         err().print("Stopped.")
 
@@ -131,7 +132,25 @@ def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json
             return
         err().print(f"{settings.workers} worker(s) of queue {settings.queue}; Ctrl-C stops them.")
 
-    Supervisor(worker_children(settings)).run(on_started=announce)
+    if await_store(settings):
+        Supervisor(worker_children(settings)).run(on_started=announce)
+
+
+def await_store(settings: Settings, *, within: float | None = None) -> bool:
+    """Wait until the server of PLIANT_REDIS_URL answers; return False if Ctrl-C or SIGTERM ended that, as it may end the processes.
+
+    Raises
+    ------
+    StoreUnavailable
+        It does not answer `within` seconds.
+    """
+    from pliant.worker.processes.preflight import wait_for_store
+
+    try:
+        wait_for_store(settings, lambda message: err().print(message, markup=False, highlight=False), within=within)
+    except KeyboardInterrupt:
+        return False
+    return True
 
 
 def read_settings(data: Path | None, workers: int | None) -> Settings:

@@ -73,3 +73,17 @@ def test_an_invalid_url_of_a_store_is_reported_once_as_an_invalid_setting(
     assert result.output.count(f"PLIANT_{name}: expected {expected}") == 1
     assert "invalid_setting" in result.output
     assert "secret" not in result.output
+
+
+@pytest.mark.parametrize("command", ["up", "work"])
+def test_an_interruption_while_waiting_for_the_store_starts_nothing(
+    run: Run, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("time.sleep", interrupted)
+    result = run(command, PLIANT_REDIS_URL="redis://:secret@127.0.0.1:9")
+    assert result.exit_code == Exit.DONE
+    assert result.output.count("The job store at redis://127.0.0.1:9 is unavailable (ConnectionError).") == 1
+    assert "secret" not in result.output

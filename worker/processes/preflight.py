@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+
 from pliant.worker.environment import variable_of
 from pliant.worker.errors import InvalidSetting, StoreUnavailable
 from pliant.worker.processes.memory import check_workers
 from pliant.worker.settings import Settings
+
+ASK_EVERY = 1.0
+"""Seconds between two attempts to reach a server that does not answer."""
 
 
 def check_settings(settings: Settings) -> None:
@@ -34,3 +40,34 @@ def check_settings(settings: Settings) -> None:
                 got=repr(settings.blob_url),
                 hint=f"Make the folder for the user that runs Pliant, or name another one ({fault.reason}).",
             ) from fault
+
+
+def wait_for_store(settings: Settings, tell: Callable[[str], None], *, within: float | None = None) -> None:
+    """Wait until the server of PLIANT_REDIS_URL answers; return at once without that setting.
+
+    Processes that start without it would end. `tell` gets a message at once and then ever less often. `within`: seconds; None: no
+    limit.
+
+    Raises
+    ------
+    StoreUnavailable
+        It does not answer within that time.
+    """
+    if settings.redis_url is None:
+        return
+    from pliant.worker.store.connection import ping
+    from pliant.worker.store.outage import Outage
+
+    outage = Outage(redis_url=settings.redis_url, tell=tell)
+    began = time.monotonic()
+    while True:
+        try:
+            ping(settings.redis_url)
+        except StoreUnavailable as error:
+            if within is not None and time.monotonic() > began + within:
+                raise
+            outage.failed(error)
+            time.sleep(ASK_EVERY)
+        else:
+            outage.answered()
+            return
