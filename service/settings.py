@@ -43,6 +43,22 @@ Origins = Annotated[
     Listed, AfterValidator(_origins), Field(description="origins such as https://example.org, separated by commas")
 ]
 
+_HOST = re.compile(r"(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::\d{1,5})?")
+
+
+def _hosts(given: tuple[str, ...]) -> tuple[str, ...]:
+    for each in given:
+        if _HOST.fullmatch(each) is None:
+            raise ValueError(f"{each} is not the value of a Host header")
+    return given
+
+
+Hosts = Annotated[
+    Listed,
+    AfterValidator(_hosts),
+    Field(description="names such as pliant.example.org, without scheme and path, separated by commas"),
+]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServiceSettings:
@@ -70,8 +86,8 @@ class ServiceSettings:
     """Longest wait that `Prefer: wait=n` can request, in seconds."""
     heartbeat_seconds: float = Field(default=HEARTBEAT_SECONDS, gt=0)
     """Seconds without an event after which an event stream sends a comment line."""
-    allowed_hosts: Listed = ()
-    """Accepted values of the Host header, separated by commas. Empty: the names of the loopback address if the service is
+    allowed_hosts: Hosts = ()
+    """Accepted values of the Host header, separated by commas; ports do not count. Empty: the names of the loopback address if the service is
     bound to it, else any. `/healthz`, `/readyz` and `/metrics` accept every host."""
     auth: Auth = "auto"
     """Whether a request needs a token: `required`, `off`, or `auto`, which is off on the loopback address and required on any
