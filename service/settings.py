@@ -60,6 +60,20 @@ Hosts = Annotated[
 ]
 
 
+def _proxies(given: tuple[str, ...]) -> tuple[str, ...]:
+    """Check what Uvicorn does not: it takes anything else for the name of a proxy, which no connection has."""
+    for each in given if given != ("*",) else ():
+        ipaddress.ip_network(each)
+    return given
+
+
+Proxies = Annotated[
+    Listed,
+    AfterValidator(_proxies),
+    Field(description="addresses or networks such as 10.0.0.0/8, separated by commas, or * alone"),
+]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServiceSettings:
     """Settings of the service. A field NAME is read from the variable PLIANT_NAME."""
@@ -87,14 +101,14 @@ class ServiceSettings:
     heartbeat_seconds: float = Field(default=HEARTBEAT_SECONDS, gt=0)
     """Seconds without an event after which an event stream sends a comment line."""
     allowed_hosts: Hosts = ()
-    """Accepted values of the Host header, separated by commas; ports do not count. Empty: the names of the loopback address if the service is
-    bound to it, else any. `/healthz`, `/readyz` and `/metrics` accept every host."""
+    """Accepted values of the Host header, separated by commas; ports do not count. Empty: the names of the loopback address if
+    the service is bound to it, else any. `/healthz`, `/readyz` and `/metrics` accept every host."""
     auth: Auth = "auto"
     """Whether a request needs a token: `required`, `off`, or `auto`, which is off on the loopback address and required on any
     other."""
     cors_origins: Origins = ()
     """Origins whose pages may call the service, separated by commas; empty: none."""
-    trusted_proxies: Listed = ()
+    trusted_proxies: Proxies = ()
     """Addresses or networks of proxies whose `X-Forwarded-For` is trusted, separated by commas; `*` for any. Empty: none,
     because any user of the machine could otherwise choose the address to which rate limits apply."""
     presigned_redirects: bool = True
