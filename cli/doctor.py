@@ -19,7 +19,7 @@ from pliant.cli.extras import missing_modules, require_server
 from pliant.cli.paths import installation
 from pliant.cli.session import HOME, Json, Session, Url
 from pliant.cli.show import out, print_json
-from pliant.cli.up import Data, read_settings
+from pliant.cli.up import Data, read_settings, unknown_variables
 
 if TYPE_CHECKING:
     from pliant.worker.settings import Settings
@@ -65,6 +65,7 @@ def doctor(
         *check_python(),
         *check_packages(),
         *check_blas(),
+        *check_variables(),
         *check_cores(),
         *check_memory(),
         *check_storage(data or settings_here().data),
@@ -181,6 +182,14 @@ def check_blas() -> Iterator[Finding]:
         )
     else:
         yield Finding("BLAS", "good", found)
+
+
+def check_variables() -> Iterator[Finding]:
+    """Check that every variable with our prefix is known."""
+    if missing_modules():
+        return
+    for warning in unknown_variables():
+        yield Finding("settings", "note", warning, "docs/reference/settings.md lists all settings.")
 
 
 def check_cores() -> Iterator[Finding]:

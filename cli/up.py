@@ -19,7 +19,7 @@ import typer
 from pliant.cli.extras import require_server
 from pliant.cli.paths import make_folder
 from pliant.cli.session import Json
-from pliant.cli.show import err, out, print_json
+from pliant.cli.show import err, out, print_json, show_warnings
 
 if TYPE_CHECKING:
     from pliant.worker.processes.supervisor import Child
@@ -81,6 +81,7 @@ def up(
     from pliant.worker.processes.valkey import Valkey
 
     settings, service = read_settings(data, workers), ServiceSettings.from_environment()
+    show_warnings(unknown_variables())
     check_settings(settings)
     host = service.host if host is None else host
     port = free_port(host, service.port if port is None else port)
@@ -122,6 +123,7 @@ def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json
     from pliant.worker.processes.supervisor import Supervisor, worker_children
 
     settings = read_settings(data, workers)
+    show_warnings(unknown_variables())
     check_settings(settings)
     make_folder(settings.data, "--data")
 
@@ -134,6 +136,15 @@ def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json
 
     if await_store(settings):
         Supervisor(worker_children(settings)).run(on_started=announce)
+
+
+def unknown_variables() -> list[str]:
+    """Return a warning for each variable that looks like a setting and is none."""
+    from pliant.service.settings import ServiceSettings
+    from pliant.worker.environment import warnings_of_unknown
+    from pliant.worker.settings import Settings as WorkerSettings
+
+    return warnings_of_unknown(WorkerSettings, ServiceSettings)
 
 
 def await_store(settings: Settings, *, within: float | None = None) -> bool:
@@ -197,10 +208,12 @@ def address(host: str, port: int) -> str:
 def service_child(settings: Settings, host: str, port: int, url: str, *, auth: str) -> Child:
     """Return the API process as a child that counts as started once every component is ready."""
     from pliant.service.settings import ServiceSettings
-    from pliant.worker.environment import given
+    from pliant.worker.environment import given, unknown
     from pliant.worker.processes.supervisor import Child
+    from pliant.worker.settings import Settings as WorkerSettings
 
     env = {**settings.to_environment(), "PLIANT_HOST": host, "PLIANT_PORT": str(port), "PLIANT_AUTH": auth}
+    env |= dict.fromkeys(unknown(WorkerSettings, ServiceSettings), "")  # reported already; empty ones are not
     # Keep the access log out of this terminal, unless a log level was set.
     if "log_level" not in given(ServiceSettings):
         env["PLIANT_LOG_LEVEL"] = "warning"

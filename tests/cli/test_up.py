@@ -8,10 +8,12 @@ from pathlib import Path
 
 import pytest
 from pliant.cli import app
-from pliant.cli.doctor import check_memory
+from pliant.cli.doctor import check_memory, check_variables
 from pliant.cli.exits import Exit
+from pliant.cli.up import service_child
 from pliant.worker.processes import memory
 from pliant.worker.processes.supervisor import Supervisor
+from pliant.worker.settings import Settings
 from typer.testing import CliRunner, Result
 
 Run = Callable[..., Result]
@@ -87,3 +89,16 @@ def test_an_interruption_while_waiting_for_the_store_starts_nothing(
     assert result.exit_code == Exit.DONE
     assert result.output.count("The job store at redis://127.0.0.1:9 is unavailable (ConnectionError).") == 1
     assert "secret" not in result.output
+
+
+@pytest.mark.parametrize("command", ["up", "work"])
+def test_an_unknown_variable_is_named_once(run: Run, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
+    monkeypatch.setattr(Supervisor, "run", lambda *_, **__: None)
+    sentence = "PLIANT_WORKRES is no setting of Pliant and has no effect. Did you mean PLIANT_WORKERS?"
+    result = run(command, "--port", "0", PLIANT_WORKRES="2") if command == "up" else run(command, PLIANT_WORKRES="2")
+    assert result.exit_code == Exit.DONE, result.output
+    assert result.output.count(sentence) == 1
+    child = service_child(Settings(), "127.0.0.1", 1, "http://127.0.0.1:1", auth="off")
+    assert child.env["PLIANT_WORKRES"] == "", "the service would name it again"
+    (finding,) = check_variables()
+    assert (finding.verdict, finding.found) == ("note", sentence)

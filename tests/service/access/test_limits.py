@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import time
+from pathlib import Path
 
 import httpx
 import pytest
@@ -227,6 +228,22 @@ def test_proxy_headers_are_ignored_unless_a_proxy_is_trusted(monkeypatch: pytest
     assert main.main() == 0
     assert [config.proxy_headers for config in configured] == [False, True]
     assert configured[1].forwarded_allow_ips == ["127.0.0.1", "10.0.0.0/8"]
+
+
+def test_the_service_warns_about_unknown_variables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("PLIANT_DATA", str(tmp_path))
+    monkeypatch.setenv("PLIANT_TRUSTED_PROXIE", "127.0.0.1")
+    monkeypatch.setattr(main, "configure_logging", lambda *_: None)
+    monkeypatch.setattr(main, "check_access", refuse)
+    assert main.main() == 2
+    sentence = "PLIANT_TRUSTED_PROXIE is no setting of Pliant and has no effect. Did you mean PLIANT_TRUSTED_PROXIES?"
+    assert sentence in [record.getMessage() for record in caplog.records]
+
+
+def refuse(*_: object) -> None:
+    raise InvalidSetting("PLIANT_AUTH", expected="a valid token", got="none")
 
 
 @pytest.mark.parametrize("wrong", ["abc", "proxy.example", "10.0.0.1/8", "127.0.0.1:80", "10.0.0.0/8,*"])
