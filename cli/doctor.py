@@ -19,7 +19,7 @@ from pliant.cli.extras import missing_modules, require_server
 from pliant.cli.paths import installation
 from pliant.cli.session import HOME, Json, Session, Url
 from pliant.cli.show import out, print_json
-from pliant.cli.up import Data, read_settings
+from pliant.cli.up import Data, read_settings, unknown_variables
 
 if TYPE_CHECKING:
     from pliant.worker.settings import Settings
@@ -65,7 +65,9 @@ def doctor(
         *check_python(),
         *check_packages(),
         *check_blas(),
+        *check_variables(),
         *check_cores(),
+        *check_memory(),
         *check_storage(data or settings_here().data),
         *check_valkey(),
         *check_blobs(),
@@ -182,6 +184,14 @@ def check_blas() -> Iterator[Finding]:
         yield Finding("BLAS", "good", found)
 
 
+def check_variables() -> Iterator[Finding]:
+    """Check that every variable with our prefix is known."""
+    if missing_modules():
+        return
+    for warning in unknown_variables():
+        yield Finding("settings", "note", warning, "docs/reference/settings.md lists all settings.")
+
+
 def check_cores() -> Iterator[Finding]:
     """Check how the cores are divided among workers."""
     from pliant.worker.settings import usable_cores
@@ -193,6 +203,22 @@ def check_cores() -> Iterator[Finding]:
         yield Finding("cores", "note", found, "More threads than cores: lower PLIANT_WORKERS or PLIANT_THREADS.")
     else:
         yield Finding("cores", "good", found)
+
+
+def check_memory() -> Iterator[Finding]:
+    """Check that the workers fit into the memory."""
+    from pliant.worker.errors import InvalidSetting
+    from pliant.worker.processes.memory import check_workers, memory_there
+
+    settings = settings_here()
+    try:
+        check_workers(settings)
+    except InvalidSetting as fault:
+        yield Finding("memory", "bad", str(fault), "`pliant up` would not start: lower PLIANT_WORKERS.")
+        return
+    there = memory_there()
+    if there > 0:
+        yield Finding("memory", "good", f"{there / 1e9:.1f} GB for {settings.workers} worker(s)")
 
 
 def check_storage(data: Path) -> Iterator[Finding]:
@@ -321,22 +347,18 @@ def check_blobs() -> Iterator[Finding]:
 
 def _redis(address: str) -> Finding:
     """Check that the server accepts the credentials of the address, and that it does not evict keys."""
-    from urllib.parse import urlsplit
-
-    parts = urlsplit(address)
-    where = (
-        f"{parts.scheme}://{parts.hostname}:{parts.port or 6379}"
-        if parts.hostname
-        else f"{parts.scheme}://{parts.path}"
-    )
     advice = "Start that server, or unset PLIANT_REDIS_URL to use the embedded one."
-    from pliant.worker.errors import WorkerError
+    from pliant.worker.errors import InvalidSetting, StoreUnavailable
     from pliant.worker.store.connection import check_server
+    from pliant.worker.store.outage import address_of
 
     try:
         policy = check_server(address)
-    except WorkerError as fault:
-        return Finding("queue", "bad", f"{where}: {fault}", advice)
+    except InvalidSetting as fault:
+        return Finding("queue", "bad", str(fault), "Correct the address.")
+    except StoreUnavailable as fault:
+        return Finding("queue", "bad", f"{address_of(address)}: {fault}", advice)
+    where = address_of(address)
     if policy not in ("noeviction", ""):
         remedy = "Set maxmemory-policy to noeviction: a server that evicts keys loses jobs."
         return Finding("queue", "bad", f"{where} has maxmemory-policy {policy}", remedy)

@@ -19,7 +19,7 @@ import typer
 from pliant.cli.extras import require_server
 from pliant.cli.paths import make_folder
 from pliant.cli.session import Json
-from pliant.cli.show import err, out, print_json
+from pliant.cli.show import err, out, print_json, show_warnings
 
 if TYPE_CHECKING:
     from pliant.worker.processes.supervisor import Child
@@ -76,10 +76,13 @@ def up(
     ctx.obj.json = as_json
     require_server("pliant up")
     from pliant.service.settings import ServiceSettings
+    from pliant.worker.processes.preflight import check_settings
     from pliant.worker.processes.supervisor import Supervisor, valkey_child, worker_children
     from pliant.worker.processes.valkey import Valkey
 
     settings, service = read_settings(data, workers), ServiceSettings.from_environment()
+    show_warnings(unknown_variables())
+    check_settings(settings)
     host = service.host if host is None else host
     port = free_port(host, service.port if port is None else port)
     url = address(host, port)
@@ -92,7 +95,8 @@ def up(
             children.append(valkey_child(valkey))
         children += [*worker_children(settings), service_child(settings, host, port, url, auth=auth or service.auth)]
 
-        Supervisor(children).run(on_started=lambda: _announce(url, settings, as_json=as_json))
+        if await_store(settings, within=READY_WITHIN):
+            Supervisor(children).run(on_started=lambda: _announce(url, settings, as_json=as_json))
     if not as_json:
         err().print("Stopped.")
 
@@ -115,9 +119,12 @@ def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json
     """Run only workers, for a service that uses the same PLIANT_REDIS_URL and PLIANT_BLOB_URL."""
     ctx.obj.json = as_json
     require_server("pliant work")
+    from pliant.worker.processes.preflight import check_settings
     from pliant.worker.processes.supervisor import Supervisor, worker_children
 
     settings = read_settings(data, workers)
+    show_warnings(unknown_variables())
+    check_settings(settings)
     make_folder(settings.data, "--data")
 
     def announce() -> None:
@@ -127,7 +134,34 @@ def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json
             return
         err().print(f"{settings.workers} worker(s) of queue {settings.queue}; Ctrl-C stops them.")
 
-    Supervisor(worker_children(settings)).run(on_started=announce)
+    if await_store(settings):
+        Supervisor(worker_children(settings)).run(on_started=announce)
+
+
+def unknown_variables() -> list[str]:
+    """Return a warning for each variable that looks like a setting and is none."""
+    from pliant.service.settings import ServiceSettings
+    from pliant.worker.environment import warnings_of_unknown
+    from pliant.worker.settings import Settings as WorkerSettings
+
+    return warnings_of_unknown(WorkerSettings, ServiceSettings)
+
+
+def await_store(settings: Settings, *, within: float | None = None) -> bool:
+    """Wait until the server of PLIANT_REDIS_URL answers; return False if Ctrl-C or SIGTERM ended that, as it may end the processes.
+
+    Raises
+    ------
+    StoreUnavailable
+        It does not answer `within` seconds.
+    """
+    from pliant.worker.processes.preflight import wait_for_store
+
+    try:
+        wait_for_store(settings, lambda message: err().print(message, markup=False, highlight=False), within=within)
+    except KeyboardInterrupt:
+        return False
+    return True
 
 
 def read_settings(data: Path | None, workers: int | None) -> Settings:
@@ -174,10 +208,12 @@ def address(host: str, port: int) -> str:
 def service_child(settings: Settings, host: str, port: int, url: str, *, auth: str) -> Child:
     """Return the API process as a child that counts as started once every component is ready."""
     from pliant.service.settings import ServiceSettings
-    from pliant.worker.environment import given
+    from pliant.worker.environment import given, unknown
     from pliant.worker.processes.supervisor import Child
+    from pliant.worker.settings import Settings as WorkerSettings
 
     env = {**settings.to_environment(), "PLIANT_HOST": host, "PLIANT_PORT": str(port), "PLIANT_AUTH": auth}
+    env |= dict.fromkeys(unknown(WorkerSettings, ServiceSettings), "")  # reported already; empty ones are not
     # Keep the access log out of this terminal, unless a log level was set.
     if "log_level" not in given(ServiceSettings):
         env["PLIANT_LOG_LEVEL"] = "warning"

@@ -15,7 +15,7 @@ from fastapi import FastAPI
 from pliant.service.app import create_app
 from pliant.service.settings import ServiceSettings
 from pliant.worker import tracing
-from pliant.worker.environment import variable_of
+from pliant.worker.environment import variable_of, warnings_of_unknown
 from pliant.worker.errors import InvalidSetting, StoreUnavailable, WorkerError
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.logs import configure_logging
@@ -101,6 +101,8 @@ def main(arguments: Sequence[str] = ()) -> int:
         settings = ServiceSettings.from_environment()
         configure_logging(settings.log_level, settings.log_format)
         of_worker = Settings.from_environment()
+        for warning in warnings_of_unknown(Settings, ServiceSettings):
+            _log.warning("%s", warning)
         tokens = Tokens.open(of_worker)
         check_access(settings, tokens)
         tracing.configure(of_worker.tracing, service="pliant-api")

@@ -43,6 +43,36 @@ Origins = Annotated[
     Listed, AfterValidator(_origins), Field(description="origins such as https://example.org, separated by commas")
 ]
 
+_HOST = re.compile(r"(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::\d{1,5})?")
+
+
+def _hosts(given: tuple[str, ...]) -> tuple[str, ...]:
+    for each in given:
+        if _HOST.fullmatch(each) is None:
+            raise ValueError(f"{each} is not the value of a Host header")
+    return given
+
+
+Hosts = Annotated[
+    Listed,
+    AfterValidator(_hosts),
+    Field(description="names such as pliant.example.org, without scheme and path, separated by commas"),
+]
+
+
+def _proxies(given: tuple[str, ...]) -> tuple[str, ...]:
+    """Check what Uvicorn does not: it takes anything else for the name of a proxy, which no connection has."""
+    for each in given if given != ("*",) else ():
+        ipaddress.ip_network(each)
+    return given
+
+
+Proxies = Annotated[
+    Listed,
+    AfterValidator(_proxies),
+    Field(description="addresses or networks such as 10.0.0.0/8, separated by commas, or * alone"),
+]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServiceSettings:
@@ -70,15 +100,15 @@ class ServiceSettings:
     """Longest wait that `Prefer: wait=n` can request, in seconds."""
     heartbeat_seconds: float = Field(default=HEARTBEAT_SECONDS, gt=0)
     """Seconds without an event after which an event stream sends a comment line."""
-    allowed_hosts: Listed = ()
-    """Accepted values of the Host header, separated by commas. Empty: the names of the loopback address if the service is
-    bound to it, else any. `/healthz`, `/readyz` and `/metrics` accept every host."""
+    allowed_hosts: Hosts = ()
+    """Accepted values of the Host header, separated by commas; ports do not count. Empty: the names of the loopback address if
+    the service is bound to it, else any. `/healthz`, `/readyz` and `/metrics` accept every host."""
     auth: Auth = "auto"
     """Whether a request needs a token: `required`, `off`, or `auto`, which is off on the loopback address and required on any
     other."""
     cors_origins: Origins = ()
     """Origins whose pages may call the service, separated by commas; empty: none."""
-    trusted_proxies: Listed = ()
+    trusted_proxies: Proxies = ()
     """Addresses or networks of proxies whose `X-Forwarded-For` is trusted, separated by commas; `*` for any. Empty: none,
     because any user of the machine could otherwise choose the address to which rate limits apply."""
     presigned_redirects: bool = True

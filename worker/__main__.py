@@ -11,7 +11,7 @@ import sys
 from types import FrameType
 
 from pliant.worker.environment import read
-from pliant.worker.errors import WorkerError
+from pliant.worker.errors import StoreUnavailable, WorkerError
 from pliant.worker.execution.rq_worker import PliantWorker
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.logs import LogSettings, configure_logging
@@ -19,6 +19,7 @@ from pliant.worker.maintenance.reconciler import Reconciler
 from pliant.worker.paths import make_data_directory
 from pliant.worker.settings import NUMERICAL_THREADS, Settings
 from pliant.worker.store.connection import BLOCK_WITHIN, connect, reachable
+from pliant.worker.store.outage import described
 from pliant.worker.store.queue import RedisQueue
 from pliant.worker.store.redis import RedisRecords
 from pliant.worker.webhooks.sender import WebhookSender
@@ -98,7 +99,11 @@ def main(arguments: list[str]) -> int:
     try:
         logs, settings = read(LogSettings), Settings.from_environment()
         configure_logging(logs.log_level, logs.log_format)
-        return task(settings)
+        try:
+            return task(settings)
+        except StoreUnavailable as error:
+            sys.stderr.write(f"{described(error, settings.redis)}\n")
+            return 1
     except WorkerError as error:
         sys.stderr.write(f"{error}\n")
         return 1

@@ -11,6 +11,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
+from pliant.schemas.suggestions import closest
 from pliant.schemas.validation import alternatives
 from pliant.worker.errors import InvalidSetting
 from pydantic import BaseModel, ValidationError, create_model, model_validator
@@ -23,6 +24,19 @@ PREFIX = "PLIANT_"
 
 SECRETS = "/run/secrets"
 """Folder of secret files, as Docker and Kubernetes mount them, unless PLIANT_SECRETS_DIR names another one."""
+
+OTHER_VARIABLES = frozenset(
+    f"{PREFIX}{name}"
+    for name in (
+        "SECRETS_DIR",
+        *("URL", "TOKEN", "WEBHOOK_SECRET"),  # of the client and the command line
+        *("DOMAIN", "REDIS_PASSWORD"),  # of the Compose files
+        "PAGE",  # of the installation
+        "WORKER_PROCESS",  # set by a worker for its jobs
+        *("CHROMIUM", "EXAMPLES", "SCREENSHOTS"),  # of the tests
+    )
+)
+"""Variables with our prefix that are no settings of service and workers; they are not reported as unknown."""
 
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path"}
 
@@ -68,6 +82,30 @@ def read(record: type[T]) -> T:
 def given(record: type[Any]) -> frozenset[str]:
     """Return the names of the fields set by the environment, `.env` or the secret files. Raises the same errors as `read`."""
     return frozenset(_found(record).model_fields_set)
+
+
+def unknown(*records: type[Any]) -> dict[str, str | None]:
+    """Return the variables of the environment and of `.env` that no record reads, in upper case, and for each the one probably meant.
+
+    Empty ones do not count. Secret files are not listed, because their folder may be shared with other programs.
+    """
+    from pydantic_settings import BaseSettings, DotEnvSettingsSource
+
+    known = {variable_of(name) for record in records for name in fields_of(record)} | OTHER_VARIABLES
+    filed = DotEnvSettingsSource(BaseSettings, env_file=_dotenv(), env_file_encoding="utf-8").env_vars
+    values = {name.upper(): value for each in (filed, os.environ) for name, value in each.items()}
+    names = {name.removeprefix(PREFIX).lower() for name in known}
+    found = sorted(name for name, value in values.items() if value and name.startswith(PREFIX) and name not in known)
+    meant = {name: closest(name.removeprefix(PREFIX), names) for name in found}
+    return {name: None if near is None else variable_of(near) for name, near in meant.items()}
+
+
+def warnings_of_unknown(*records: type[Any]) -> list[str]:
+    """Return a sentence for each of the `unknown` variables."""
+    return [
+        f"{name} is no setting of Pliant and has no effect." + ("" if meant is None else f" Did you mean {meant}?")
+        for name, meant in unknown(*records).items()
+    ]
 
 
 def _found(record: type[Any]) -> BaseModel:

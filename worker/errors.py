@@ -194,6 +194,10 @@ class QuotaExceeded(WorkerError):
         )
 
 
+JOB_STORE = "The job store"
+"""Name of Redis in messages."""
+
+
 class StoreUnavailable(WorkerError):
     """Redis or the blob store does not answer, or is full."""
 
@@ -203,7 +207,7 @@ class StoreUnavailable(WorkerError):
 
     def __init__(self, what: str, *, reason: str) -> None:
         super().__init__(f"{what} is unavailable ({reason}). No data was lost; try again in a few seconds.")
-        self.reason = reason
+        self.what, self.reason = what, reason
 
 
 class DataDirectoryInUse(WorkerError):

@@ -64,7 +64,8 @@ class Settings:
     """Name of the queue and prefix of every Redis key, so that two installations can share a server."""
 
     workers: int = Field(default=1, ge=1)
-    """Number of jobs that run at once."""
+    """Number of jobs that run at once. `pliant up` and `pliant work` refuse more than fit, without a job, into the memory of the
+    machine, its container or systemd unit; each takes 70 MiB."""
 
     threads: int | None = Field(default=None, ge=1)
     """Threads of one job, for the solver and for optical flow; None: the usable cores shared evenly among the workers."""

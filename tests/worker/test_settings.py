@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 from pliant.service.settings import ServiceSettings
 from pliant.worker.control_group import group_files
-from pliant.worker.environment import expected_of, fields_of, variable_of
+from pliant.worker.environment import OTHER_VARIABLES, expected_of, fields_of, unknown, variable_of, warnings_of_unknown
 from pliant.worker.errors import InvalidSetting
 from pliant.worker.paths import LONGEST_SOCKET_PATH, socket_path
 from pliant.worker.settings import Settings, usable_cores
@@ -177,3 +178,49 @@ def test_limits_are_read_from_the_own_control_group_and_those_around_it(tmp_path
     membership.write_text("0::/\n")  # a container sees itself as the root
     assert group_files("cpu.max", root=root, membership=membership) == [root / "cpu.max"]
     assert group_files("cpu.max", root=root, membership=tmp_path / "none") == []
+
+
+def test_unknown_variables_are_named_with_the_one_that_was_meant(
+    set_variables: Callable[..., None], tmp_path: Path
+) -> None:
+    set_variables(
+        WORKRES="2", workers="2", Redis_Ulr="redis://h", ELSEWHERE_ENTIRELY="x", RETENSION="", TOKEN="t", URL="u", PORT="1",
+        SECRETS_DIR="", LOG_LEVEL="info", QUEU="unset in the environment",
+    )  # fmt: skip
+    (tmp_path / ".env").write_text("PLIANT_DOMAIN=a.example\nPLIANT_LOG_LEVLE=debug\nOTHER=1\nPLIANT_REDIS_ULR=twice\n")
+    assert unknown(Settings, ServiceSettings) == {
+        "PLIANT_ELSEWHERE_ENTIRELY": None,
+        "PLIANT_LOG_LEVLE": "PLIANT_LOG_LEVEL",
+        "PLIANT_QUEU": "PLIANT_QUEUE",
+        "PLIANT_REDIS_ULR": "PLIANT_REDIS_URL",
+        "PLIANT_WORKRES": "PLIANT_WORKERS",
+    }
+    first, second, *_ = warnings_of_unknown(Settings, ServiceSettings)
+    assert first == "PLIANT_ELSEWHERE_ENTIRELY is no setting of Pliant and has no effect."
+    assert second == "PLIANT_LOG_LEVLE is no setting of Pliant and has no effect. Did you mean PLIANT_LOG_LEVEL?"
+
+
+def test_no_variable_that_is_read_anywhere_is_unknown() -> None:
+    root = Path(__file__).parent.parent.parent
+    texts = [
+        (root / name).read_text()
+        for name in ("docker-compose.yml", "Dockerfile", "docs/reference/settings.md", "build_page.py")
+    ]
+    texts += [
+        file.read_text()
+        for file in (root / "deploy").rglob("*")
+        if file.suffix in (".yml", ".yaml", ".env", ".service")
+    ]
+    read = {name for text in texts for name in re.findall(r"\bPLIANT_[A-Z_]*[A-Z]\b", text)}
+    code = [
+        file
+        for name in ("cli", "client", "service", "worker", "tracking", "tests")
+        for file in (root / name).rglob("*.py")
+    ]
+    reading = re.compile(r"(?:environ\.get\(|environ\[|envvar=)\"(PLIANT_[A-Z_]+)\"")
+    read |= {name for file in code for name in reading.findall(file.read_text())}
+    known = {
+        variable_of(name) for record in (Settings, ServiceSettings) for name in fields_of(record)
+    } | OTHER_VARIABLES
+    assert len(read) > 20
+    assert read - known <= {"PLIANT_NAME"}, "a placeholder"

@@ -28,6 +28,7 @@ from pliant.worker.jobs.submission import RANKS, order_waiting
 from pliant.worker.jobs.validation import LARGEST_PAGE
 from pliant.worker.maintenance.retention import Retention, is_wanted
 from pliant.worker.records import Beat
+from pliant.worker.store.outage import Outage, warn
 
 logger = logging.getLogger(__name__)
 
@@ -97,11 +98,14 @@ class Reconciler:
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Call `tick` every `LOOK_EVERY` seconds until `should_stop` returns True; an unavailable store is only logged."""
+        outage = Outage(redis_url=self.jobs.settings.redis, tell=warn(logger))
         while not should_stop():
             try:
                 self.tick()
             except StoreUnavailable as error:
-                logger.warning("%s", error)
+                outage.failed(error)
+            else:
+                outage.answered()
             time.sleep(LOOK_EVERY)
 
     def _take_from_lost_workers(self, gap: float) -> None:

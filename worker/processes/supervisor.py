@@ -65,7 +65,11 @@ class _Running:
 
 
 class _StopRequested(BaseException):
-    """A signal arrived while the children were being started."""
+    """A signal arrived while the children were being started.
+
+    The signal handler raises it only during a `ready`: an exception in the middle of starting a process would lose that process, and
+    Python ignores those of a handler that runs in a hook of `fork`.
+    """
 
 
 class Supervisor:
@@ -73,7 +77,7 @@ class Supervisor:
 
     def __init__(self, children: list[Child]) -> None:
         self._running = [_Running(child) for child in children]
-        self._starting = False
+        self._waiting = False
         self._stopping = False
         self._forced = False
 
@@ -81,9 +85,11 @@ class Supervisor:
         """Start all children, in order, waiting for each one's `ready`; if one fails, stop the others and raise."""
         try:
             for each in self._running:
+                self._end_if_stopping()
                 self._launch(each)
                 if each.child.ready is not None and each.process is not None:
-                    each.child.ready(each.process)
+                    self._wait(each.child.ready, each.process)
+            self._end_if_stopping()
         except BaseException:
             self.stop()
             raise
@@ -92,9 +98,7 @@ class Supervisor:
         """Start the children and keep them running until SIGTERM or Ctrl-C; then stop them. A second signal stops waiting."""
         handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
-            self._starting = True
             self.start()
-            self._starting = False
             if on_started is not None:
                 on_started()
             while not self._stopping:
@@ -145,8 +149,20 @@ class Supervisor:
     def _on_signal(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
         self._forced = self._stopping
         self._stopping = True
-        if self._starting:
-            self._starting = False
+        if self._waiting:
+            self._waiting = False
+            raise _StopRequested
+
+    def _wait(self, ready: Callable[[subprocess.Popen[bytes]], None], process: subprocess.Popen[bytes]) -> None:
+        self._waiting = True
+        try:
+            self._end_if_stopping()  # the signal may have arrived before
+            ready(process)
+        finally:
+            self._waiting = False
+
+    def _end_if_stopping(self) -> None:
+        if self._stopping:
             raise _StopRequested
 
     def _launch_again(self, each: _Running, now: float) -> None:

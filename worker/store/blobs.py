@@ -120,8 +120,11 @@ class Blobs:
         """
         if url.startswith("memory:"):
             return cls(MemoryStore())
+        expected = "file:///FOLDER or s3://BUCKET/PREFIX"
         with answering():
             if url.startswith("file:"):
+                if not url.startswith(("file:///", "file://localhost/")):
+                    raise InvalidSetting("PLIANT_BLOB_URL", expected=expected, got=repr(url))
                 store = from_url(url, mkdir=True, automatic_cleanup=True)
                 return cls(store, directory=Path(unquote(urlsplit(url).path)))
             options: Any = {**CLIENT, **client_options(os.environ)}
@@ -131,7 +134,6 @@ class Blobs:
                     raise ValueError(url)
                 return cls(from_url(url, client_options=options, retry_config=RETRIES), remote=True)
             except ValueError:
-                expected = "file:///FOLDER or s3://BUCKET/PREFIX"
                 raise InvalidSetting("PLIANT_BLOB_URL", expected=expected, got=repr(url)) from None
 
     def put(self, key: str, file: Path, *, media_type: str = "application/octet-stream") -> int:

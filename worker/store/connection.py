@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import redis
-from pliant.worker.errors import InvalidSetting, StoreUnavailable
+from pliant.worker.errors import JOB_STORE, InvalidSetting, StoreUnavailable
 from pliant.worker.store.calls import SilentServer
 from redis.backoff import ExponentialWithJitterBackoff
 from redis.client import Pipeline
@@ -103,7 +103,25 @@ def check_server(url: str) -> str:
                 return ""
             return found.get("maxmemory-policy", "")
     except redis.ResponseError as error:  # a required password is missing, or the user lacks permission
-        raise StoreUnavailable("The job store", reason=str(error)[:200]) from error
+        raise StoreUnavailable(JOB_STORE, reason=str(error)[:200]) from error
+    finally:
+        client.close()
+
+
+def ping(url: str) -> None:
+    """Check that the server answers and accepts the password in the URL; what its user may do is not checked.
+
+    Raises
+    ------
+    StoreUnavailable
+        The server does not answer or rejects the password.
+    InvalidSetting
+        The URL is malformed.
+    """
+    client = connect(url, decode=True, retries=0, answer_within=CONNECT_WITHIN)
+    try:
+        with reachable(), suppress(redis.exceptions.NoPermissionError):
+            client.ping()
     finally:
         client.close()
 
@@ -114,12 +132,12 @@ def reachable() -> Iterator[None]:
     try:
         yield
     except redis.AuthenticationError as error:
-        raise StoreUnavailable("The job store", reason="it refuses the password") from error
+        raise StoreUnavailable(JOB_STORE, reason="it refuses the password") from error
     except (redis.ConnectionError, redis.TimeoutError, redis.exceptions.ClusterDownError) as error:
-        raise StoreUnavailable("The job store", reason=type(error).__name__) from error
+        raise StoreUnavailable(JOB_STORE, reason=type(error).__name__) from error
     except redis.OutOfMemoryError as error:
-        raise StoreUnavailable("The job store", reason="its memory limit is reached") from error
+        raise StoreUnavailable(JOB_STORE, reason="its memory limit is reached") from error
     except redis.ResponseError as error:
         if not str(error).startswith(("MISCONF", "LOADING", "READONLY")):
             raise
-        raise StoreUnavailable("The job store", reason=str(error)[:200]) from error
+        raise StoreUnavailable(JOB_STORE, reason=str(error)[:200]) from error

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import redis
-from pliant.worker.errors import NewerData, StoreUnavailable
+from pliant.worker.errors import JOB_STORE, NewerData, StoreUnavailable
 
 logger = logging.getLogger(__name__)
 
@@ -85,7 +85,7 @@ def prepare(client: Any, prefix: str) -> int:
     except redis.exceptions.LockNotOwnedError:
         logger.warning("the migration took longer than its lock lasts; another process may have repeated it")
     except redis.exceptions.LockError as error:
-        raise StoreUnavailable("The job store", reason="another process still migrates the records") from error
+        raise StoreUnavailable(JOB_STORE, reason="another process still migrates the records") from error
     if count:
         logger.info("migrated %d job records from version %d to %d", count, version or 1, CURRENT)
     return count

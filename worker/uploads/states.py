@@ -8,7 +8,7 @@ from functools import lru_cache
 from typing import Any
 
 import redis
-from pliant.worker.errors import StoreUnavailable
+from pliant.worker.errors import JOB_STORE, StoreUnavailable
 from pliant.worker.store.connection import connect, reachable
 from pydantic import BaseModel, ConfigDict
 
@@ -96,7 +96,7 @@ class UploadStates:
         with reachable():
             held = lock.acquire()
         if not held:
-            raise StoreUnavailable("The job store", reason="the space for uploads is being counted")
+            raise StoreUnavailable(JOB_STORE, reason="the space for uploads is being counted")
         try:
             yield
         finally:

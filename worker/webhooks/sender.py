@@ -23,6 +23,7 @@ from pliant.worker.errors import StoreUnavailable, UnknownJob
 from pliant.worker.records import Records, Webhook
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
+from pliant.worker.store.outage import Outage, warn
 from pliant.worker.store.outbox import Lease, Outbox
 from pliant.worker.webhooks.address_policy import Address, NotPublic, checked_addresses, resolve
 from pliant.worker.webhooks.message import message, signed
@@ -62,6 +63,7 @@ class WebhookSender:
 
     records: Records
     outbox: Outbox
+    outage: Outage
     networks: str = ""
     """`Settings.webhook_networks`."""
     resolve: Resolve = resolve
@@ -80,7 +82,8 @@ class WebhookSender:
     def open(cls, settings: Settings, records: Records) -> WebhookSender:
         """Return the sender for the stores in the settings."""
         outbox = Outbox(connect(settings.redis, decode=True), prefix=settings.queue)
-        return cls(records=records, outbox=outbox, networks=settings.webhook_networks)
+        outage = Outage(redis_url=settings.redis, tell=warn(logger, "webhooks: "))
+        return cls(records=records, outbox=outbox, outage=outage, networks=settings.webhook_networks)
 
     def start(self) -> None:
         """Start a thread that sends messages."""
@@ -114,7 +117,9 @@ class WebhookSender:
                 try:
                     taken = await asyncio.to_thread(self._take, busy)
                 except StoreUnavailable as error:
-                    logger.warning("webhooks: %s", error)
+                    self.outage.failed(error)
+                else:
+                    self.outage.answered()
             if taken is None:
                 await asyncio.sleep(LOOK_EVERY)
                 continue

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 import httpx
 import pytest
 from pliant.service.middleware.security_headers import SECURITY_HEADERS
+from pliant.service.settings import ServiceSettings
+from pliant.worker.errors import InvalidSetting
 from serving import Running, Serve, finish, submit, until
 from starlette.requests import Request
 from starlette.responses import Response
@@ -96,6 +98,21 @@ def test_only_the_listed_hosts_are_accepted(serve: Serve) -> None:
         ("x.pliant.example", 421),
     ):
         assert httpx.get(f"{running.url}/v1/limits", headers={"Host": host}).status_code == status
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    ["https://a.example", "a.example/", "a.example/path", "a.example:", "a.example:port", "::1", "*", "user@a.example"],
+)
+def test_a_listed_host_that_no_request_can_have_is_refused(monkeypatch: pytest.MonkeyPatch, wrong: str) -> None:
+    for allowed in ("a.example", "A.example:443,127.0.0.1", "[::1],[::1]:8000", "under_score"):
+        monkeypatch.setenv("PLIANT_ALLOWED_HOSTS", allowed)
+        assert ServiceSettings.from_environment().allowed_hosts == tuple(allowed.split(","))
+    monkeypatch.setenv("PLIANT_ALLOWED_HOSTS", f"localhost, {wrong}")
+    expected = "PLIANT_ALLOWED_HOSTS: expected names such as pliant.example.org, without scheme and path"
+    with pytest.raises(InvalidSetting, match=expected) as caught:
+        ServiceSettings.from_environment()
+    assert wrong in caught.value.got
 
 
 @pytest.mark.parametrize("path", ["/healthz", "/readyz", "/metrics"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import time
+from pathlib import Path
 
 import httpx
 import pytest
@@ -12,7 +13,7 @@ from pliant.client import Client, TooManyRequests
 from pliant.client.retry import Retry
 from pliant.service import __main__ as main
 from pliant.service.middleware.rate_limit import MOST_CLIENTS, Rates, _client
-from pliant.service.settings import USUAL_RATE
+from pliant.service.settings import USUAL_RATE, ServiceSettings
 from pliant.worker.errors import InvalidSetting
 from pliant.worker.tokens import Scope
 from serving import Running, Serve, claim, form, settings_from, submit, tracks
@@ -227,3 +228,30 @@ def test_proxy_headers_are_ignored_unless_a_proxy_is_trusted(monkeypatch: pytest
     assert main.main() == 0
     assert [config.proxy_headers for config in configured] == [False, True]
     assert configured[1].forwarded_allow_ips == ["127.0.0.1", "10.0.0.0/8"]
+
+
+def test_the_service_warns_about_unknown_variables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("PLIANT_DATA", str(tmp_path))
+    monkeypatch.setenv("PLIANT_TRUSTED_PROXIE", "127.0.0.1")
+    monkeypatch.setattr(main, "configure_logging", lambda *_: None)
+    monkeypatch.setattr(main, "check_access", refuse)
+    assert main.main() == 2
+    sentence = "PLIANT_TRUSTED_PROXIE is no setting of Pliant and has no effect. Did you mean PLIANT_TRUSTED_PROXIES?"
+    assert sentence in [record.getMessage() for record in caplog.records]
+
+
+def refuse(*_: object) -> None:
+    raise InvalidSetting("PLIANT_AUTH", expected="a valid token", got="none")
+
+
+@pytest.mark.parametrize("wrong", ["abc", "proxy.example", "10.0.0.1/8", "127.0.0.1:80", "10.0.0.0/8,*"])
+def test_trusted_proxies_are_addresses_or_networks(monkeypatch: pytest.MonkeyPatch, wrong: str) -> None:
+    for trusted in ("*", "::1,127.0.0.1", "10.0.0.0/8,fd00::/8"):
+        monkeypatch.setenv("PLIANT_TRUSTED_PROXIES", trusted)
+        assert ServiceSettings.from_environment().trusted_proxies == tuple(trusted.split(","))
+    monkeypatch.setenv("PLIANT_TRUSTED_PROXIES", wrong)
+    expected = r"PLIANT_TRUSTED_PROXIES: expected addresses or networks such as 10\.0\.0\.0/8, .*, or \* alone, got"
+    with pytest.raises(InvalidSetting, match=expected):
+        ServiceSettings.from_environment()

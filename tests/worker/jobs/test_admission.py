@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from pliant.schemas.job import Interpretation, Status
 from pliant.schemas.options import Options
-from pliant.worker.errors import InvalidRequest
+from pliant.worker.errors import InvalidRequest, InvalidSetting
 from pliant.worker.formats import read_inputs
 from pliant.worker.formats.cost import LIBRARIES, estimated, largest_that_fits
 from pliant.worker.jobs.admission import check_fits
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
+from pliant.worker.processes.memory import IDLE_WORKER, check_workers, memory_for_a_job
 from pliant.worker.processes.memory import LIBRARIES as UNUSED
-from pliant.worker.processes.memory import memory_for_a_job
 from pliant.worker.settings import Settings
 from pliant.worker.store.queue import alive_key
 from worker_house import House
@@ -174,6 +174,16 @@ def test_memory_for_a_job_is_its_limit_or_its_share_of_the_machine(tmp_path: Pat
     assert memory_for_a_job(Settings(), groups=[group, around]) == 2_000_000_000
     assert memory_for_a_job(Settings(memory_limit=2 << 30), groups=[group]) == (2 << 30) - UNUSED
     assert memory_for_a_job(Settings(), groups=[tmp_path / "none"]) == physical
+
+
+def test_workers_that_do_not_fit_into_the_memory_are_refused(tmp_path: Path) -> None:
+    group = tmp_path / "memory.max"
+    group.write_text(f"{3 * IDLE_WORKER}\n")
+    check_workers(Settings(workers=3), groups=[group])
+    with pytest.raises(InvalidSetting, match=r"PLIANT_WORKERS: expected at most 3, .* 0\.2 GB .*, got 4\. Lower it"):
+        check_workers(Settings(workers=4), groups=[group])
+    group.write_text("1000\n")
+    check_workers(Settings(workers=1), groups=[group])
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -191,6 +192,48 @@ def test_a_signal_during_start_stops_the_started_children() -> None:
     assert process.wait(10) == 0
     process.stdout.close()
     assert gone(child)
+
+
+class Fake:
+    """A child process that runs until it is asked to end."""
+
+    pid, ended = 1, False
+
+    def poll(self) -> int | None:
+        return 0 if self.ended else None
+
+    def send_signal(self, number: int) -> None:
+        self.ended = True
+
+
+@pytest.mark.parametrize("moment", ["launch", "last launch", "ready"])
+def test_a_signal_is_not_lost_at_any_moment_of_the_start(monkeypatch: pytest.MonkeyPatch, moment: str) -> None:
+    """Python ignores an exception of a signal handler that runs in a hook of `fork`; here, whoever starts the process swallows it."""
+    launched, waited, announced = list[Fake](), list[str](), list[bool]()
+
+    def stop() -> None:
+        with suppress(BaseException):
+            signal.raise_signal(signal.SIGTERM)
+
+    def launch(argv: list[str], **_: object) -> Fake:
+        launched.append(Fake())
+        if moment == argv[0]:
+            stop()
+        return launched[-1]
+
+    def ready(_: object) -> None:
+        waited.append("ready")
+        if moment == "ready":
+            stop()
+
+    monkeypatch.setattr(subprocess, "Popen", launch)
+    names = ("launch", "other", "last launch")
+    supervisor = Supervisor([Child(name=name, argv=[name], ready=ready) for name in names])
+    supervisor.run(on_started=lambda: announced.append(True))
+    assert len(launched) == (3 if moment == "last launch" else 1)
+    assert len(waited) == {"launch": 0, "last launch": 2, "ready": 1}[moment]
+    assert all(each.ended for each in launched)
+    assert announced == []
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a child of its parent's end")

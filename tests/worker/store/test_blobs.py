@@ -232,7 +232,9 @@ def test_connection_variables_are_passed_to_the_store(monkeypatch: pytest.Monkey
     assert given == {**CLIENT, **client_options(variables)}
 
 
-@pytest.mark.parametrize("url", ["/srv/blobs", "ftp://host/blobs", "s3:///blobs", "s3://[bucket/blobs"])
+@pytest.mark.parametrize(
+    "url", ["/srv/blobs", "ftp://host/blobs", "s3:///blobs", "s3://[bucket/blobs", "file://host/blobs", "file:blobs"]
+)
 def test_blob_stores_of_other_kinds_are_refused(url: str) -> None:
     expected = "PLIANT_BLOB_URL: expected file:///FOLDER or s3://BUCKET/PREFIX, got "
     with pytest.raises(InvalidSetting, match=re.escape(f"{expected}{url!r}")):

@@ -1,0 +1,73 @@
+"""What is checked before processes are started, so that an invalid setting is reported once and by its name."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from pliant.worker.environment import variable_of
+from pliant.worker.errors import InvalidSetting, StoreUnavailable
+from pliant.worker.processes.memory import check_workers
+from pliant.worker.settings import Settings
+
+ASK_EVERY = 1.0
+"""Seconds between two attempts to reach a server that does not answer."""
+
+
+def check_settings(settings: Settings) -> None:
+    """Check what the processes would end with at their start; no server is called.
+
+    Raises
+    ------
+    InvalidSetting
+        The workers do not fit into the memory, or the URL of a store is malformed or names a folder that cannot be made.
+    """
+    check_workers(settings)
+    # The clients are imported for given URLs only: they would stay in the memory of this process.
+    if settings.redis_url is not None:
+        from pliant.worker.store.connection import connect
+
+        connect(settings.redis_url, decode=True).close()
+    if settings.blob_url is not None:
+        from pliant.worker.store.blobs import Blobs
+
+        try:
+            Blobs.open(settings.blob_url)
+        except StoreUnavailable as fault:  # remote stores are not called here: this is a folder
+            raise InvalidSetting(
+                variable_of("blob_url"),
+                expected="a folder that exists or can be made",
+                got=repr(settings.blob_url),
+                hint=f"Make the folder for the user that runs Pliant, or name another one ({fault.reason}).",
+            ) from fault
+
+
+def wait_for_store(settings: Settings, tell: Callable[[str], None], *, within: float | None = None) -> None:
+    """Wait until the server of PLIANT_REDIS_URL answers; return at once without that setting.
+
+    Processes that start without it would end. `tell` gets a message at once and then ever less often. `within`: seconds; None: no
+    limit.
+
+    Raises
+    ------
+    StoreUnavailable
+        It does not answer within that time.
+    """
+    if settings.redis_url is None:
+        return
+    from pliant.worker.store.connection import ping
+    from pliant.worker.store.outage import Outage
+
+    outage = Outage(redis_url=settings.redis_url, tell=tell)
+    began = time.monotonic()
+    while True:
+        try:
+            ping(settings.redis_url)
+        except StoreUnavailable as error:
+            if within is not None and time.monotonic() > began + within:
+                raise
+            outage.failed(error)
+            time.sleep(ASK_EVERY)
+        else:
+            outage.answered()
+            return
