@@ -25,6 +25,7 @@ from pliant.solver.reconstruction.surface import isometric_verdict, solution_of,
 from pliant.solver.records import KnownCamera, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.solution import Solution
+from pliant.solver.threads import serial_blas
 from pliant.solver.tracks.frame_order import as_they_came, content_order, differences, in_order, resolved_order
 
 
@@ -75,7 +76,7 @@ def solve(
     settings, why = resolved_order(tracks, settings)
     sheet = tries_isometry(cameras, settings)
     monitor = monitored(tracks, cameras, settings, on_step, should_stop, sheet=sheet)
-    with pulses_to(monitor.pulse):
+    with serial_blas(), pulses_to(monitor.pulse):
         if settings.order == "film":
             return _with_reason(_solved(tracks, mesh, cameras, settings, monitor, scratch), why)
         order = content_order(differences(tracks))

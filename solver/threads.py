@@ -1,4 +1,9 @@
-"""Threads over frames or points: NumPy and SciPy release the interpreter lock."""
+"""Threads over frames or points: NumPy and SciPy release the interpreter lock.
+
+The solver's matrices are small and factored thousands of times. Dividing each over threads, as OpenBLAS does by default, costs more than it
+saves (`python -m benchmarks.speed threads`), and where other programs run, its threads wait for each other. So BLAS runs in one thread
+inside a solve, and the solver divides large work itself.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from threading import Lock
 
 from pliant.solver.pulse import pulse
 
@@ -22,8 +28,8 @@ _LIMIT: ContextVar[int | None] = ContextVar("threads", default=None)
 def threads_limited(count: int | None) -> Iterator[None]:
     """Limit solves inside the `with` block to `count` threads; None uses all available cores.
 
-    The limit applies to the calling thread or task, so two solves in one process can have different limits. It does not
-    affect the threads of BLAS, which reads its own environment variables when it is loaded.
+    The limit applies to the calling thread or task, so two solves in one process can have different limits. BLAS always runs in one thread
+    inside a solve.
 
     Raises
     ------
@@ -62,3 +68,38 @@ def over_ranges(work: Callable[[int, int], None], count: int, *, smallest: int =
     with ThreadPoolExecutor(cores) as pool:
         for done in [pool.submit(work, a, b) for a, b in itertools.pairwise(cuts)]:
             done.result()
+
+
+class _SerialBlas:
+    """Limits BLAS to one thread while at least one solve of the process runs, in whatever order they start and end."""
+
+    def __init__(self) -> None:
+        self._lock, self._running = Lock(), 0
+        self._restore: Callable[[], None] = lambda: None
+
+    def enter(self) -> None:
+        from threadpoolctl import threadpool_limits  # processes that solve nothing need not load it
+
+        with self._lock:
+            if self._running == 0:
+                self._restore = threadpool_limits(limits=1, user_api="blas").restore_original_limits
+            self._running += 1
+
+    def leave(self) -> None:
+        with self._lock:
+            self._running -= 1
+            if self._running == 0:
+                self._restore()
+
+
+_SERIAL_BLAS = _SerialBlas()
+
+
+@contextmanager
+def serial_blas() -> Iterator[None]:
+    """Run BLAS in one thread inside the `with` block, in all threads of the process; then restore its number of threads."""
+    _SERIAL_BLAS.enter()
+    try:
+        yield
+    finally:
+        _SERIAL_BLAS.leave()

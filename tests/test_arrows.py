@@ -41,6 +41,7 @@ AT_HOME = {
     "scipy": {"solver", "tracking", "worker"},
     "cv2": {"tracking"},
     "clarabel": {"solver"},
+    "threadpoolctl": {"solver"},
 }
 MOST_FILES = 16
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.threads import available_cores
+from pliant.solver.threads import available_cores, serial_blas
 from pliant.tracking.advice import warnings_before, warnings_of, warnings_unread
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.chaining import FIRST_SPACING, Chain, chain
@@ -116,7 +116,7 @@ def track_film(
     )  # fmt: skip
     stop = should_stop or (lambda: False)
     workers = threads or min(4, available_cores())
-    with opencv_serial(), FrameStore() as store, ThreadPoolExecutor(workers) as pool:
+    with opencv_serial(), serial_blas(), FrameStore() as store, ThreadPoolExecutor(workers) as pool:
         run = Run(opened, store, pool, on_step or (lambda _: None), stop, on_warnings or (lambda _: None))
         mask = None if region is None else read_region(region, opened.size)
         run.on_warnings(warnings_unread(whole=region is None, region_frame=region_frame))

@@ -5,6 +5,7 @@ r"""Measure time and memory, beside baselines and against the size.
     python -m benchmarks.speed growth --cameras estimated --settings "" --outliers 0 --kind talk --fixed-points 300 \
         --against-points "" --against-frames 300,1000,3000,10000 --results benchmarks/results/growth.jsonl
     python -m benchmarks.speed mesh --frames 30 --points 10000        a mesh and a grid of equal F and P
+    python -m benchmarks.speed threads                                BLAS in one thread and in its default number
 
 Without `--data` the sequence is synthetic (`--kind`). Each number comes from a separate process. Wall time counts on an idle machine; CPU
 time of all threads is listed too, because it stays comparable when other work shares the cores.
@@ -21,6 +22,7 @@ import shlex
 import sys
 from pathlib import Path
 
+from benchmarks.speed.blas_threads import blas_threads
 from benchmarks.speed.growth import FIXED_FRAMES, FIXED_POINTS, FRAMES, POINTS, Sizes, growth, mesh_against_grid
 from benchmarks.speed.side_by_side import BASELINES, Workload, compare
 
@@ -41,6 +43,8 @@ def main() -> None:
             fixed_points=options.fixed_points, fixed_frames=options.fixed_frames,
         )  # fmt: skip
         growth(work, sizes, results=options.results, command=command_of(sys.argv[1:]))
+    elif options.what == "threads":
+        blas_threads()
     else:
         mesh_against_grid(work)
 
@@ -63,7 +67,7 @@ def _parser() -> argparse.ArgumentParser:
     def sizes(text: str) -> tuple[int, ...]:
         return tuple(int(word) for word in words(text))
 
-    parser.add_argument("what", choices=("compare", "growth", "mesh"))
+    parser.add_argument("what", choices=("compare", "growth", "mesh", "threads"))
     parser.add_argument("--data", type=Path, help="directory of sequences; a gallery face when not given")
     parser.add_argument("--only", default="facescan99", help="the first sequence whose name holds this word")
     parser.add_argument("--kind", default="face", choices=("face", "flag", "sphere", "talk"), help="gallery sequence")

@@ -26,6 +26,7 @@ from pliant.solver.refinement.learned import Refinement
 from pliant.solver.refinement.observed import Observed, cross_fitted
 from pliant.solver.settings import Settings
 from pliant.solver.stages import stage_of
+from pliant.solver.threads import serial_blas
 from pliant.solver.tracks.frame_order import resolved_order
 from pliant.solver.tracks.frame_selection import evenly_spread, informative_frames
 from pliant.solver.tracks.noise import OUTLIER_SHARE
@@ -109,7 +110,7 @@ def estimate_cameras(
     settings, _ = resolved_order(tracks, settings)
     observations = observe(tracks, known, settings)
     monitor = monitored(tracks, known, settings, on_step, should_stop, only=STAGES)
-    with pulses_to(monitor.pulse):
+    with serial_blas(), pulses_to(monitor.pulse):
         found = cameras_of(observations, monitor)
     monitor.report(Step("finish", 1.0))
     return found

@@ -19,6 +19,7 @@ from pliant.solver.records import Floats, KnownCamera, Step, Tracks
 from pliant.solver.refinement.covariance_learning import learn_covariance
 from pliant.solver.refinement.depth_rounds import with_depth_map
 from pliant.solver.shapes.jackknife import Changes, learning_changes
+from pliant.solver.threads import serial_blas
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -125,7 +126,7 @@ def learn_prior(
     monitor = monitored(
         tracks, observations.known, observations.settings, on_step, should_stop, only=("model_order", "covariance")
     )
-    with pulses_to(monitor.pulse):
+    with serial_blas(), pulses_to(monitor.pulse):
         found = prior_of(cameras, monitor, seed=observations.settings.seed if seed is None else seed)
     monitor.report(Step("finish", 1.0))
     return found
@@ -141,7 +142,7 @@ def _with_learning_data(cameras: Cameras, should_stop: ShouldStop | None) -> Cam
     known = KnownCamera(camera.rotations, camera.scales / observations.world_scale, camera.focal, centre)
     lens = given_lens(observations.normalized, settings, known)
     monitor = monitored(observations.tracks, known, settings, None, should_stop, only=STAGES)
-    with pulses_to(monitor.pulse):
+    with serial_blas(), pulses_to(monitor.pulse):
         return cameras_of(replace(observations, settings=settings, known=known, lens=lens), monitor)
 
 

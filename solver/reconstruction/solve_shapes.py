@@ -20,6 +20,7 @@ from pliant.solver.reconstruction.start import begin, check_shapes, without_lear
 from pliant.solver.records import Floats, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.solution import Solution
+from pliant.solver.threads import serial_blas
 
 
 def solve_shapes(
@@ -79,7 +80,7 @@ def solve_shapes(
     check_mesh(tracks, mesh, settings)
     settings = without_learned_prior(settings) if prior is None else settings
     monitor = monitored(tracks, None, settings, on_step, should_stop, only=("shapes", "finish", "trust"))
-    with pulses_to(monitor.pulse):
+    with serial_blas(), pulses_to(monitor.pulse):
         return shapes_of(
             tracks, cameras, prior, mesh, settings, monitor,
             seconds={}, start=None if first is None else first * observations.world_scale, scratch=scratch,

@@ -26,6 +26,7 @@ from pliant.solver.shapes.outlier_rejection import gross_outliers
 from pliant.solver.shapes.setup import build_problem, with_bending
 from pliant.solver.shapes.sparsely_observed import WellObserved, well_observed
 from pliant.solver.shapes.state import State
+from pliant.solver.threads import serial_blas
 from pliant.solver.tracks.noise import OUTLIER_SHARE
 from pliant.solver.tracks.normalization import Normalized
 
@@ -117,7 +118,7 @@ def find_outliers(
     check_tracks(tracks)
     used = cameras.observations.settings if settings is None else settings
     monitor = monitored(tracks, None, used, on_step, should_stop, only=("shapes",))
-    with pulses_to(monitor.pulse):
+    with serial_blas(), pulses_to(monitor.pulse):
         found = begin(tracks, cameras, prior, mesh, used, monitor).rejected()
     monitor.report(Step("finish", 1.0))
     return found

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from pliant.solver import KnownCamera, Settings, Solution, gallery, solve, threads_limited
 from pliant.solver.operators import normal_equations
-from pliant.solver.threads import available_cores, over_ranges
+from pliant.solver.threads import available_cores, over_ranges, serial_blas
+from threadpoolctl import threadpool_info, threadpool_limits
 
 
 @pytest.fixture
@@ -81,3 +82,34 @@ def test_the_result_does_not_depend_on_the_number_of_threads(many_cores: None, m
     one, four = solved(1), solved(4)
     np.testing.assert_array_equal(one.trace.iterations, four.trace.iterations)
     np.testing.assert_array_equal(one.shapes, four.shapes)
+
+
+def blas_threads() -> set[int]:
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+def test_blas_has_one_thread_during_a_solve_and_its_own_number_afterwards() -> None:
+    seen: set[int] = set()
+    case = gallery.face(5, 20)
+    with threadpool_limits(limits=2, user_api="blas"):
+        solve(case.tracks, settings=Settings(max_reweightings=1), on_step=lambda _: seen.update(blas_threads()))
+        assert seen == {1}
+        assert blas_threads() == {2}
+
+
+def test_blas_stays_in_one_thread_until_the_last_of_several_solves_ends() -> None:
+    with threadpool_limits(limits=2, user_api="blas"):
+        one, other = serial_blas(), serial_blas()
+        one.__enter__()
+        other.__enter__()
+        one.__exit__(None, None, None)
+        assert blas_threads() == {1}
+        other.__exit__(None, None, None)
+        assert blas_threads() == {2}
+
+
+def test_a_failed_solve_leaves_the_threads_of_blas_as_they_were() -> None:
+    with threadpool_limits(limits=2, user_api="blas"):
+        with pytest.raises(ZeroDivisionError), serial_blas():
+            raise ZeroDivisionError
+        assert blas_threads() == {2}
