@@ -70,19 +70,26 @@ def over_ranges(work: Callable[[int, int], None], count: int, *, smallest: int =
             done.result()
 
 
+def _unchanged() -> None:
+    """Restore nothing."""
+
+
 class _SerialBlas:
     """Limits BLAS to one thread while at least one solve of the process runs, in whatever order they start and end."""
 
     def __init__(self) -> None:
         self._lock, self._running = Lock(), 0
-        self._restore: Callable[[], None] = lambda: None
+        self._restore: Callable[[], None] = _unchanged
 
     def enter(self) -> None:
-        from threadpoolctl import threadpool_limits  # processes that solve nothing need not load it
+        from threadpoolctl import ThreadpoolController  # processes that solve nothing need not load it
 
         with self._lock:
             if self._running == 0:
-                self._restore = threadpool_limits(limits=1, user_api="blas").restore_original_limits
+                libraries = ThreadpoolController().select(user_api="blas")
+                # OpenBLAS allocates buffers when the number is set, and waits for ever where a memory limit forbids that.
+                several = any(library["num_threads"] != 1 for library in libraries.info())
+                self._restore = libraries.limit(limits=1).restore_original_limits if several else _unchanged
             self._running += 1
 
     def leave(self) -> None:

@@ -337,11 +337,12 @@ def test_invalid_arguments_and_settings_are_reported(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_fsck_command_reports_inconsistencies(house: House) -> None:
-    command = [sys.executable, "-m", "pliant.worker", "fsck"]
+    command = [sys.executable, "-m", "pliant.cli", "fsck"]
     env = {**os.environ, **house.settings.to_environment()}
     clean = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
-    assert (clean.returncode, clean.stdout) == (0, "The stores are consistent with the job records.\n")
+    assert (clean.returncode, clean.stdout) == (0, "✓ stored the stores are consistent with the job records\n")
     house.jobs.blobs.put("jobs/nobody/nobody-1/inputs.npz", house.short_inputs)
     found = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
-    assert (found.returncode, found.stdout) == (1, "File jobs/nobody/nobody-1/inputs.npz belongs to no job.\n")
+    assert "File jobs/nobody/nobody-1/inputs.npz belongs to no job." in found.stdout
+    assert found.returncode == 8
     house.jobs.blobs.delete("jobs/nobody/")
