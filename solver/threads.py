@@ -87,7 +87,7 @@ class _SerialBlas:
         with self._lock:
             if self._running == 0:
                 libraries = ThreadpoolController().select(user_api="blas")
-                # OpenBLAS allocates buffers when the number is set, and waits for ever where a memory limit forbids that.
+                # Where it is 1 already, it is not set: in a forked process with a memory limit, OpenBLAS does not return from that.
                 several = any(library["num_threads"] != 1 for library in libraries.info())
                 self._restore = libraries.limit(limits=1).restore_original_limits if several else _unchanged
             self._running += 1

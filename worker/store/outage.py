@@ -49,16 +49,16 @@ class Outage:
         now = self.clock()
         if self._pause == 0:
             self._pause, self._told = FIRST_PAUSE, now
-            self.tell(f"{described(error, self.redis_url)} Waiting until it answers")
+            self.tell(f"{described(error, self.redis_url)} Waiting until it answers.")
         elif now >= self._told + self._pause:
             self._pause, self._told = min(2 * self._pause, LONGEST_PAUSE), now
-            self.tell(f"{described(error, self.redis_url)} Still waiting")
+            self.tell(f"{described(error, self.redis_url)} Still waiting.")
 
     def answered(self) -> None:
         """Report the end of an outage, if there was one."""
         if self._pause > 0:
             self._pause = 0.0
-            self.tell("The store answers again")
+            self.tell("The store answers again.")
 
 
 def warn(logger: logging.Logger, prefix: str = "") -> Callable[[str], None]:

@@ -464,3 +464,9 @@ def test_a_given_focal_length_with_which_the_depths_diverge_has_no_figure_in_the
     for sentence in (described(view, 100.0), str(improbable(view, 100.0))):
         assert "the depths of the points diverge" in sentence
         assert "gains" not in sentence
+
+
+def test_the_standard_deviation_of_the_focal_length_is_said_to_count_noise_alone() -> None:
+    candidates = (Candidate(0.0, -1.0), Candidate(0.1, -2.0))
+    view = Perspective(np.zeros((3, 2)), np.zeros(2), curvature=0.1, curvature_std=0.01, candidates=candidates)
+    assert described(view, 100.0).endswith("is 1000 ± 100 from noise alone.")

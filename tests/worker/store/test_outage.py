@@ -42,16 +42,16 @@ def test_an_outage_is_reported_at_once_then_ever_less_often_and_its_end() -> Non
     while now < 600:
         outage.failed(StoreUnavailable(JOB_STORE, reason="late"))
         now += 1
-    assert told[0] == (0.0, "The job store at redis://h:6379 is unavailable (late). Waiting until it answers")
-    assert {text for _, text in told[1:]} == {"The job store at redis://h:6379 is unavailable (late). Still waiting"}
+    assert told[0] == (0.0, "The job store at redis://h:6379 is unavailable (late). Waiting until it answers.")
+    assert {text for _, text in told[1:]} == {"The job store at redis://h:6379 is unavailable (late). Still waiting."}
     times = [when for when, _ in told]
     assert times[:6] == [0, 2, 6, 14, 30, 62]
     assert all(later - before == LONGEST_PAUSE for before, later in pairwise(times[6:]))
     outage.answered()
     outage.answered()
-    assert [text for _, text in told[-2:]].count("The store answers again") == 1
+    assert [text for _, text in told[-2:]].count("The store answers again.") == 1
     outage.failed(StoreUnavailable(JOB_STORE, reason="late"))
-    assert told[-1][1].endswith("Waiting until it answers")
+    assert told[-1][1].endswith("Waiting until it answers.")
 
 
 def test_processes_wait_for_the_server_and_its_address_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,7 +64,7 @@ def test_processes_wait_for_the_server_and_its_address_is_named(monkeypatch: pyt
         settings = Settings(redis_url=f"redis://:secret@127.0.0.1:{port}/2")
         with pytest.raises(StoreUnavailable, match="ConnectionError"):
             wait_for_store(settings, told.append, within=0.1)
-    expected = f"The job store at redis://127.0.0.1:{port} is unavailable (ConnectionError). Waiting until it answers"
+    expected = f"The job store at redis://127.0.0.1:{port} is unavailable (ConnectionError). Waiting until it answers."
     assert told == [expected]
     answers = iter([StoreUnavailable(JOB_STORE, reason="late"), None])
 
@@ -75,4 +75,4 @@ def test_processes_wait_for_the_server_and_its_address_is_named(monkeypatch: pyt
     monkeypatch.setattr("pliant.worker.store.connection.ping", ping)
     told.clear()
     wait_for_store(settings, told.append)
-    assert told[-1] == "The store answers again"
+    assert told[-1] == "The store answers again."
