@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from pliant.solver import Settings, Tracks, solve
 from pliant.solver.evaluation.alignment import align
-from pliant.solver.isometry.anchors import Anchors, connected, farthest_points, nearest_neighbours
+from pliant.solver.isometry.anchors import connected, farthest_points, nearest_neighbours
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 
 from benchmarks.accuracy.spoiling import SPOILINGS, spoiled
@@ -100,11 +100,11 @@ def maximum_depth_alone(sheet: Sheet) -> dict[str, Any]:
     points, seen = sheet.case.tracks.points, sheet.case.tracks.visible > 0
     often = np.flatnonzero(seen.mean(axis=0) >= np.quantile(seen.mean(axis=0), 0.5))
     kept = often[farthest_points(points[:, often], seen[:, often], min(ANCHORS, len(often)))]
-    anchors = Anchors(np.where(seen[:, kept, None], points[:, kept], 0.0), seen[:, kept], 0.0)
-    edges = nearest_neighbours(anchors)
-    known = connected(anchors.seen, edges)
-    rays = np.concatenate([(anchors.points - sheet.centre) / sheet.focal, np.ones((*known.shape, 1))], axis=2)
-    depths = maximum_depth(SurfaceGraph(rays, known, edges))
+    anchors = np.where(seen[:, kept, None], points[:, kept], 0.0)
+    edges = nearest_neighbours(anchors, seen[:, kept])
+    known = connected(seen[:, kept], edges)
+    rays = np.concatenate([(anchors - sheet.centre) / sheet.focal, np.ones((*known.shape, 1))], axis=2)
+    depths = maximum_depth(SurfaceGraph(rays, known.astype(float), edges))
     assert sheet.case.shapes is not None
     if depths is None:
         return {"error": None}

@@ -64,25 +64,34 @@ class Anchors:
     points: Floats
     """Image positions, shape `(F, A, 2)`, the tracks' unit; 0 where hidden."""
 
-    seen: NDArray[np.bool_]
-    """Mask of the valid positions, shape `(F, A)`."""
+    confidence: Floats
+    """Inverse variances of the positions, relative to those of full confidence, shape `(F, A)`; 0 where hidden."""
 
     noise_std: float
-    """Robust standard deviation of the tracks about their patches, the tracks' unit."""
+    """Robust standard deviation about their patches of tracks of full confidence, the tracks' unit."""
+
+    denoised: bool
+    """Whether the positions are predictions of patches, as in dense tracks; otherwise they are those of the tracks."""
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Mask of the valid positions, shape `(F, A)`."""
+        return self.confidence > 0
 
 
-def choose_anchors(points: Floats, seen: NDArray[np.bool_], count: int) -> Anchors:
+def choose_anchors(points: Floats, confidence: Floats, count: int) -> Anchors:
     """Return about `count` anchors.
 
     Parameters
     ----------
     points : shape (F, P, 2)
         Tracks, any unit.
-    seen : shape (F, P)
-        Mask of the visible observations.
+    confidence : shape (F, P)
+        Inverse variances of the observations, relative to the maximum; 0 where hidden.
     count : int
         Requested number of anchors. Fewer are returned if fewer points qualify, possibly none.
     """
+    seen = confidence > 0
     pool = _pool(seen)
     views = unlike_frames(points[:, pool], seen[:, pool], VIEWS)
     spread = farthest_points(points[views][:, pool], seen[views][:, pool], min(2 * count, len(pool)))
@@ -91,25 +100,32 @@ def choose_anchors(points: Floats, seen: NDArray[np.bool_], count: int) -> Ancho
     apart = _apart(points[views][:, pool], seen[views][:, pool], spread)
     patches = pool[np.argsort(apart, axis=1, kind="stable")[:, :size]]
     patches[:, 0] = pool[spread]
-    fitted, fits, noise = _fit_patches(points, seen, patches)
+    fitted, fits, noise = _fit_patches(points, confidence, patches)
     own = pool[spread]
-    tested = seen[:, own] & fits
-    agrees = tested & (np.linalg.norm(points[:, own] - fitted, axis=2) <= GROSS * noise)
+    sure = confidence[:, own]
+    tested = (sure > 0) & fits
+    agrees = tested & (np.sqrt(sure) * np.linalg.norm(points[:, own] - fitted, axis=2) <= GROSS * noise)
     faithful = agrees.sum(axis=0) >= FAITHFUL * tested.sum(axis=0)
-    placed, known = (fitted, fits) if share >= DENSE else (points[:, own], seen[:, own] & (agrees | ~fits))
+    # Predictions of patches average many observations, so that their confidences differ little.
+    dense = share >= DENSE
+    placed, sure = (fitted, fits.astype(np.float64)) if dense else (points[:, own], sure * (agrees | ~fits))
+    known = sure > 0
     enough = known.sum(axis=0)
     good = np.flatnonzero(faithful & (2 * enough >= enough.max()) & (enough >= 2))
     if len(good) == 0:
-        return Anchors(np.zeros((len(points), 0, 2)), np.zeros((len(points), 0), dtype=bool), noise)
+        return Anchors(np.zeros((len(points), 0, 2)), np.zeros((len(points), 0)), noise, dense)
     kept = good[farthest_points(placed[:, good], known[:, good], min(count, len(good)))]
-    return Anchors(np.where(known[:, kept, None], placed[:, kept], 0.0), known[:, kept], noise)
+    return Anchors(np.where(known[:, kept, None], placed[:, kept], 0.0), sure[:, kept], noise, dense)
 
 
-def nearest_neighbours(anchors: Anchors, *, neighbours: int = NEIGHBOURS) -> Indices:
-    """Return edges `(E, 2)` from every anchor to the anchors that stay nearest to it in the image over all frames."""
-    count = anchors.points.shape[1]
-    apart = _apart(anchors.points, anchors.seen, np.arange(count), quantile=LARGEST_QUANTILE)
-    together = anchors.seen.T.astype(np.float64) @ anchors.seen
+def nearest_neighbours(points: Floats, seen: NDArray[np.bool_], *, neighbours: int = NEIGHBOURS) -> Indices:
+    """Return edges `(E, 2)` from every anchor to the anchors that stay nearest to it over all frames.
+
+    `points (F, A, 2)` are their image positions, `seen (F, A)` is the mask of the valid ones.
+    """
+    count = points.shape[1]
+    apart = _apart(points, seen, np.arange(count), quantile=LARGEST_QUANTILE)
+    together = seen.T.astype(np.float64) @ seen
     apart[together < 2] = np.inf
     np.fill_diagonal(apart, np.inf)
     nearest = np.argsort(apart, axis=1, kind="stable")[:, : min(neighbours, count - 1)]
@@ -211,23 +227,25 @@ def _over_frames(values: Floats, quantile: float) -> Floats:
     return np.where(counted > 0, np.take_along_axis(ordered, rank[None], axis=0)[0], np.inf)
 
 
-def _fit_patches(points: Floats, seen: NDArray[np.bool_], patches: Indices) -> tuple[Floats, NDArray[np.bool_], float]:
+def _fit_patches(points: Floats, confidence: Floats, patches: Indices) -> tuple[Floats, NDArray[np.bool_], float]:
     """Return the positions `(F, N, 2)` that N patches `(N, q)` predict for their first points, a mask of reliable ones, and the noise."""
     image = points[:, patches].transpose(1, 0, 2, 3)
-    known = seen[:, patches].transpose(1, 0, 2)
+    sure = confidence[:, patches].transpose(1, 0, 2)
+    known = sure > 0
     middle = _middle(image, known)
     image = np.where(known[..., None], image - middle, 0.0)
     radius = np.linalg.norm(image, axis=3)
     size = float(np.median(radius[known])) or float(radius.max()) or 1.0  # the median is 0 if most points coincide
-    shape, weight = _starting_shapes(image, radius, size), known / (1 + (radius / (3 * size)) ** 2) ** 2
+    shape, weight = _starting_shapes(image, radius, size), sure / (1 + (radius / (3 * size)) ** 2) ** 2
     for sweep in range(SWEEPS):
         pulse()
         inner, shift = _fit_motion(shape, weight, image)
         shape = _fit_shapes(inner, weight, image - shift[:, :, None])
         off = np.linalg.norm(np.einsum("nqa,nfac->nfqc", shape, inner) + shift[:, :, None] - image, axis=3)
+        off *= np.sqrt(sure)
         noise = max(float(np.median(off[known])) / RAYLEIGH_MEDIAN, 1e-6 * float(size))
         scale = max(noise, ANNEALED ** (sweep + 1) * float(size))
-        weight = known / (1 + (off / (3 * scale)) ** 2) ** 2
+        weight = sure / (1 + (off / (3 * scale)) ** 2) ** 2
     place = np.einsum("na,nfac->nfc", shape[:, 0], inner) + shift + middle[:, :, 0]
     fits = (known & (off <= GROSS * noise)).sum(axis=2)
     trusted = (fits >= RANK + 3) & (2 * fits >= known.sum(axis=2))

@@ -2,7 +2,8 @@
 
 The template flattens the graph of edge lengths (Isomap: shortest paths, then classical scaling; Tenenbaum, de Silva and Langford 2000).
 In every frame, a spline maps the visible points from the image to the template; the median over frames is a point's template position,
-which is robust to outliers. A second spline per frame maps all points, including hidden ones, from the template to space.
+which is robust to outliers. A second spline per frame maps all points, including hidden ones, from the template to space. The image of a
+visible point is the mean of its track and the spline's image, weighted by their inverse variances.
 """
 
 from __future__ import annotations
@@ -90,8 +91,8 @@ def complete_anchors(points: Floats, seen: NDArray[np.bool_], template: Floats) 
 
 
 def extend(
-    tracks: Floats, seen: NDArray[np.bool_], *, images: Floats, known: NDArray[np.bool_], anchors: Floats,
-    template: Floats, focal: float, centre: Floats,
+    tracks: Floats, confidence: Floats, *, images: Floats, known: NDArray[np.bool_], anchors: Floats,
+    template: Floats, focal: float, centre: Floats, noise_std: float,
 ) -> Extended:  # fmt: skip
     """Return the positions of all points in all frames.
 
@@ -99,8 +100,8 @@ def extend(
     ----------
     tracks : array, shape (F, P, 2)
         Image positions, pixels.
-    seen : array of bool, shape (F, P)
-        Mask of the visible ones.
+    confidence : array, shape (F, P)
+        Inverse variances of the observations, relative to the maximum; 0 where hidden.
     images : array, shape (F, A, 2)
         Image positions of the anchors, pixels.
     known : array of bool, shape (F, A)
@@ -113,7 +114,10 @@ def extend(
         Focal length, pixels.
     centre : array, shape (2,)
         Principal point, pixels.
+    noise_std : float
+        Standard deviation of observations of full confidence, pixels; 0 if it is unknown, for points that lie where the tracks show them.
     """
+    seen, sure = confidence > 0, np.sqrt(confidence)
     place = _placed(tracks, seen, images, known, template)
     placed: NDArray[np.bool_] = np.asarray(np.isfinite(place).all(axis=1))
     flat = anchors.transpose(1, 0, 2).reshape(len(template), -1)
@@ -121,15 +125,28 @@ def extend(
     space = space.reshape(-1, len(anchors), 3).transpose(1, 0, 2).copy()
     nearest = 1e-3 * float(np.median(anchors[..., 2]))
     space[..., 2] = np.maximum(space[..., 2], nearest)
-    off = np.linalg.norm(focal * space[..., :2] / space[..., 2:] + centre - tracks, axis=2)
+    image = focal * space[..., :2] / space[..., 2:] + centre
+    off = sure * np.linalg.norm(image - tracks, axis=2)
     compared = seen & placed
     limit = OUTLIER_DEVIATIONS * max(
         float(np.median(off[compared])) / RAYLEIGH_MEDIAN, SPLINE_ERROR * _deviation(images, known)
     )
     outliers: NDArray[np.bool_] = np.asarray(compared & (off > limit))
     own = compared & ~outliers
+    tracks = image + share_of_track(off[own], confidence, noise_std)[..., None] * (tracks - image)
     rays = np.concatenate([(tracks - centre) / focal, np.ones((*seen.shape, 1))], axis=2)
     return Extended(np.where(own[..., None], rays * space[..., 2:], space), outliers, placed)
+
+
+def share_of_track(off: Floats, confidence: Floats, noise_std: float) -> Floats:
+    """Return the weight of every track, `(F, P)`, in its mean with the surface's image, both weighted by their inverse variances.
+
+    `off` are distances between the two, times the roots of the confidences: their variance is that of the noise and of the surface's image.
+    """
+    noise = noise_std**2
+    surface = max((float(np.median(off)) / RAYLEIGH_MEDIAN) ** 2 - noise, 0.0) if off.size else 0.0
+    total = confidence * surface + noise
+    return np.divide(confidence * surface, total, out=np.ones_like(total), where=total > 0)
 
 
 def _deviation(images: Floats, known: NDArray[np.bool_]) -> float:

@@ -67,7 +67,7 @@ class FocalSearch:
         """Return the rays and edges of the given frames at a focal length."""
         rays = (self.anchors.points[frames] - self.centre) / focal
         rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2)
-        return SurfaceGraph(rays, self.seen[frames], self.edges)
+        return SurfaceGraph(rays, (self.anchors.confidence * self.seen)[frames], self.edges)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

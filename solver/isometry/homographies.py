@@ -7,25 +7,27 @@ in Computer Vision*, 2004, chapter 13). The singular values of the tracks reveal
 from __future__ import annotations
 
 import numpy as np
-from pliant.solver.isometry.anchors import Anchors
+from numpy.typing import NDArray
 from pliant.solver.records import Floats
 
 FEWEST_COMMON = 8
 """Minimum number of common anchors of two frames; a homography has eight parameters, which four points determine."""
 
 
-def off_homography(anchors: Anchors) -> float:
+def off_homography(points: Floats, seen: NDArray[np.bool_]) -> float:
     """Return the distance of the frames from homographies of a reference frame, relative to the object's size in the image.
+
+    `points (F, A, 2)` are image positions, `seen (F, A)` is the mask of the valid ones.
 
     The median over the other frames of the median distance of the anchors, minimised over the reference frame; infinite if no two frames
     share `FEWEST_COMMON` anchors.
     """
-    frames = range(len(anchors.seen))
+    frames = range(len(seen))
     least = np.inf
     for one in frames:
-        common = [(other, anchors.seen[one] & anchors.seen[other]) for other in frames if other != one]
+        common = [(other, seen[one] & seen[other]) for other in frames if other != one]
         found = [
-            unlike_homography(anchors.points[one, both], anchors.points[other, both])
+            unlike_homography(points[one, both], points[other, both])
             for other, both in common
             if both.sum() >= FEWEST_COMMON
         ]

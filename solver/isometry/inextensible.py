@@ -35,11 +35,16 @@ class SurfaceGraph:
     rays: Floats
     """Viewing rays, shape `(F, A, 3)`, third coordinate 1."""
 
-    seen: NDArray[np.bool_]
-    """Mask of the visible points, shape `(F, A)`."""
+    confidence: Floats
+    """Inverse variances of the points' image positions, relative to those of full confidence, shape `(F, A)`; 0 where hidden."""
 
     edges: Indices
     """Pairs of neighbours, shape `(E, 2)`."""
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Mask of the visible points, shape `(F, A)`."""
+        return self.confidence > 0
 
     @property
     def pairs(self) -> tuple[Indices, Indices]:
@@ -53,6 +58,13 @@ class SurfaceGraph:
         number = np.cumsum(self.seen.ravel()).reshape(self.seen.shape) - 1
         frame, edge = self.pairs
         return number[frame, self.edges[edge, 0]], number[frame, self.edges[edge, 1]]
+
+    @property
+    def weights(self) -> Floats:
+        """Weight of the length of every pair: the harmonic mean of the confidences of its ends, whose variances add."""
+        frame, edge = self.pairs
+        first, second = (self.confidence[frame, self.edges[edge, end]] for end in (0, 1))
+        return np.asarray(2 / (1 / first + 1 / second))
 
 
 def maximum_depth(graph: SurfaceGraph, *, should_stop: ShouldStop = never) -> Floats | None:

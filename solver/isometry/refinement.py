@@ -1,10 +1,10 @@
 """Refinement of depths so that edges keep their lengths from frame to frame.
 
-Minimise Σ_fe ρ(‖x_fi − x_fj‖ − l_e) over log depths ζ and edge lengths l, x_fi = exp(ζ_fi) r_fi. ρ is the soft-L1 loss
-ε² (√(1 + (r/ε)²) − 1), which limits the influence of observations that do not move with the surface. Σ l_e is kept constant, which fixes
-the free scale. Gauss–Newton steps with Levenberg–Marquardt damping. Only the lengths couple the frames, so the depths of each frame are
-eliminated from the normal equations (Triggs et al., "Bundle Adjustment – A Modern Synthesis", 2000, section 6.1), and conjugate gradients
-solve the reduced equations of the lengths.
+Minimise Σ_fe ρ(√w_fe (‖x_fi − x_fj‖ − l_e)) over log depths ζ and edge lengths l, x_fi = exp(ζ_fi) r_fi, with weights w from the
+confidences of i and j. ρ is the soft-L1 loss ε² (√(1 + (r/ε)²) − 1), which limits the influence of observations that do not move with the
+surface. Σ l_e is kept constant, which fixes the free scale. Gauss–Newton steps with Levenberg–Marquardt damping. Only the lengths couple
+the frames, so the depths of each frame are eliminated from the normal equations (Triggs et al., "Bundle Adjustment – A Modern Synthesis",
+2000, section 6.1), and conjugate gradients solve the reduced equations of the lengths.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def inconsistency(lengths: Floats) -> float:
 
 
 def residuals(graph: SurfaceGraph, log_depths: Floats, lengths: Floats) -> tuple[Floats, sparse.csr_matrix]:
-    """Return ‖x_fi − x_fj‖ − l_e of every pair `(N,)`, and its Jacobian `(N, O + E)` in O visible log depths and E lengths.
+    """Return √w (‖x_fi − x_fj‖ − l_e) of every pair `(N,)`, and its Jacobian `(N, O + E)` in O visible log depths and E lengths.
 
     Parameters
     ----------
@@ -97,11 +97,11 @@ def residuals(graph: SurfaceGraph, log_depths: Floats, lengths: Floats) -> tuple
     length = np.maximum(np.linalg.norm(apart, axis=1), np.finfo(np.float64).tiny)
     along = apart / length[:, None]
     towards = (np.einsum("ni,ni->n", along, points[first]), -np.einsum("ni,ni->n", along, points[second]))
-    row = np.arange(len(edge))
-    values = np.concatenate([*towards, -np.ones(len(edge))])
+    row, root = np.arange(len(edge)), np.sqrt(graph.weights)
+    values = np.concatenate([root * each for each in (*towards, -np.ones(len(edge)))])
     columns = np.concatenate([first, second, len(log_depths) + edge])
     size = (len(edge), len(log_depths) + len(lengths))
-    return length - lengths[edge], sparse.csr_matrix((values, (np.tile(row, 3), columns)), shape=size)
+    return root * (length - lengths[edge]), sparse.csr_matrix((values, (np.tile(row, 3), columns)), shape=size)
 
 
 def refine(graph: SurfaceGraph, depths: Floats, *, iterations: int = 30, should_stop: ShouldStop = never) -> Isometry:

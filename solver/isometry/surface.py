@@ -22,6 +22,7 @@ from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import Isometry, edge_lengths, inconsistency, refine, typical
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, Tracks
+from pliant.solver.tracks.normalization import relative
 
 ANCHORS = 60
 """Number of points in the conic program; its time grows with their number times the number of frames."""
@@ -121,7 +122,7 @@ def isometric_surface(
     Parameters
     ----------
     tracks : Tracks
-        Pixels, x right, y down. Every visible observation counts equally, whatever its confidence.
+        Pixels, x right, y down. Confidences are inverse variances relative to the largest.
     focal : float, optional
         Focal length in pixels; None searches for it.
     principal_point : (x, y), optional
@@ -148,12 +149,12 @@ def isometric_surface(
 
 def _search(tracks: Tracks, centre: Floats, focal: float, required: bool, should_stop: ShouldStop) -> FocalSearch | str:
     """Return the anchors of all frames, or the reason why dissimilar frames at one focal length exclude an isometric sheet."""
-    seen = tracks.visible > 0
-    part = _some_frames(tracks.points, seen)
-    search = _prepared(tracks.points[part], seen[part], centre, should_stop)
+    confidence = relative(tracks.visible, float(tracks.visible.max()))
+    part = _some_frames(tracks.points, confidence > 0)
+    search = _prepared(tracks.points[part], confidence[part], centre, should_stop)
     against = _implausible(search, focal, required)
     if against is None and len(part) < tracks.num_frames:
-        search = _prepared(tracks.points, seen, centre, should_stop)
+        search = _prepared(tracks.points, confidence, centre, should_stop)
     return against or search or TOO_LITTLE
 
 
@@ -191,10 +192,10 @@ def sheetlike(tracks: Tracks) -> float | None:
 
     Needs neither focal length nor principal point.
     """
-    seen = tracks.visible > 0
-    part = _some_frames(tracks.points, seen)
-    search = _prepared(tracks.points[part], seen[part], np.zeros(2), never)
-    off = float("inf") if search is None else off_homography(search.anchors)
+    confidence = relative(tracks.visible, float(tracks.visible.max()))
+    part = _some_frames(tracks.points, confidence > 0)
+    search = _prepared(tracks.points[part], confidence[part], np.zeros(2), never)
+    off = float("inf") if search is None else off_homography(search.anchors.points, search.anchors.seen)
     return off if off <= SHEETLIKE else None
 
 
@@ -204,7 +205,7 @@ def _implausible(search: FocalSearch | None, focal: float, required: bool) -> st
         return TOO_LITTLE
     if required:
         return None
-    off = off_homography(search.anchors)
+    off = off_homography(search.anchors.points, search.anchors.seen)
     if off > SHEETLIKE:
         return f"Isometry was not tested: the pictures differ from those of a plane by {off:.1%} of its size."
     changes = _glance(search, focal)
@@ -235,8 +236,7 @@ def _rigid(search: FocalSearch, surface: IsometricSurface) -> str | None:
     Images of a sheet differ from images of a plane because the sheet bends; images of a solid differ because of its constant depth. A rigid
     solid also keeps all lengths, but it is better solved as a free surface: the error of a rigid face is .0002, and .05 as a sheet.
     """
-    some = replace(search.anchors, points=search.anchors.points[search.frames], seen=search.seen[search.frames])
-    off = off_homography(some)
+    off = off_homography(search.anchors.points[search.frames], search.seen[search.frames])
     bends = deformation(surface.points[:, :: max(1, surface.points.shape[1] // FIRST_LOOK)])
     if bends >= off:
         return None
@@ -252,13 +252,13 @@ def _some_frames(points: Floats, seen: NDArray[np.bool_]) -> NDArray[np.intp]:
     return unlike_frames(points[:, often], seen[:, often], SOLVED_FRAMES)
 
 
-def _prepared(points: Floats, seen: NDArray[np.bool_], centre: Floats, should_stop: ShouldStop) -> FocalSearch | None:
-    if (seen.sum(axis=0) >= 2).sum() < MIN_ANCHORS:
+def _prepared(points: Floats, confidence: Floats, centre: Floats, should_stop: ShouldStop) -> FocalSearch | None:
+    if ((confidence > 0).sum(axis=0) >= 2).sum() < MIN_ANCHORS:
         return None
-    anchors = choose_anchors(points, seen, ANCHORS)
+    anchors = choose_anchors(points, confidence, ANCHORS)
     if anchors.points.shape[1] < MIN_ANCHORS:
         return None
-    edges = nearest_neighbours(anchors)
+    edges = nearest_neighbours(anchors.points, anchors.seen)
     if len(edges) == 0:
         return None
     known = connected(anchors.seen, edges)
@@ -273,11 +273,11 @@ def _prepared(points: Floats, seen: NDArray[np.bool_], centre: Floats, should_st
 def _glance(search: FocalSearch, focal: float) -> float:
     """Return I of the subset `SMALL_PART` at one focal length; infinite if there is no surface."""
     some, frames, neighbours = SMALL_PART
-    part = replace(search.anchors, points=search.anchors.points[:, :some], seen=search.seen[:, :some])
-    edges = nearest_neighbours(part, neighbours=neighbours)
+    seen = search.seen[:, :some]
+    edges = nearest_neighbours(search.anchors.points[:, :some], seen, neighbours=neighbours)
     used = search.frames[:frames]
-    rays = search.graph(focal, used).rays[:, :some]
-    graph = SurfaceGraph(rays, connected(part.seen, edges)[used], edges)
+    whole = search.graph(focal, used)
+    graph = SurfaceGraph(whole.rays[:, :some], whole.confidence[:, :some] * connected(seen, edges)[used], edges)
     depths = maximum_depth(graph, should_stop=search.should_stop)
     return refine(graph, depths, iterations=10).inconsistency if depths is not None else float("inf")
 
@@ -293,9 +293,7 @@ def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried) -> Isometric
         found = refine(whole, _from_similar(whole, search, found.depths), should_stop=search.should_stop)
     if not search.should_stop():
         # Short edges only: the chord of a long one is shorter than the surface between its ends.
-        near = replace(
-            whole, edges=nearest_neighbours(replace(search.anchors, seen=search.seen), neighbours=LAST_NEIGHBOURS)
-        )
+        near = replace(whole, edges=nearest_neighbours(search.anchors.points, search.seen, neighbours=LAST_NEIGHBOURS))
         depths = refine(near, found.depths, should_stop=search.should_stop).depths
         lengths = edge_lengths(whole, depths)
         found = Isometry(depths, typical(lengths), inconsistency(lengths))
@@ -304,8 +302,9 @@ def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried) -> Isometric
         return None
     points, enough = complete_anchors(found.depths[..., None] * whole.rays, search.seen, template)
     all_of_it: Extended = extend(
-        tracks.points, tracks.visible > 0, images=search.anchors.points, known=search.seen, anchors=points, template=template,
-        focal=chosen.focal, centre=search.centre,
+        tracks.points, relative(tracks.visible, float(tracks.visible.max())), images=search.anchors.points, known=search.seen,
+        anchors=points, template=template, focal=chosen.focal, centre=search.centre,
+        noise_std=search.anchors.noise_std if search.anchors.denoised else 0.0,
     )  # fmt: skip
     if not np.isfinite(all_of_it.points).all() or not enough.any():
         return None

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from pliant.solver import Settings, Tracks, solve
 from pliant.solver.isometry import surface
-from pliant.solver.isometry.anchors import Anchors
 from pliant.solver.isometry.confirmation import deformation
 from pliant.solver.isometry.homographies import FEWEST_COMMON, off_homography, unlike_homography
 from pliant.solver.isometry.surface import isometric_surface, sheetlike
@@ -16,8 +15,8 @@ from rolled_sheets import CENTRE, SIZE, one_scale_error, rolled
 from benchmarks.sequences import rolled_sheet
 
 
-def anchors_of(points: np.ndarray, seen: np.ndarray | None = None) -> Anchors:
-    return Anchors(points, np.ones(points.shape[:2], dtype=bool) if seen is None else seen, 0.0)
+def off_plane(points: np.ndarray) -> float:
+    return off_homography(points, np.ones(points.shape[:2], dtype=bool))
 
 
 def pictures(shape: np.ndarray, turns: np.ndarray, distance: float) -> np.ndarray:
@@ -33,14 +32,14 @@ def turns(degrees: float) -> np.ndarray:
 @pytest.mark.parametrize("distance", [1.8, 50.0])
 def test_images_of_a_plane_are_homographies_at_any_distance(distance: float) -> None:
     plane = np.hstack([np.random.default_rng(0).uniform(-1, 1, (30, 2)), np.zeros((30, 1))])
-    assert off_homography(anchors_of(pictures(plane, turns(35), distance))) < 1e-9
+    assert off_plane(pictures(plane, turns(35), distance)) < 1e-9
 
 
 def test_a_solid_deviates_from_homographies_with_its_depth() -> None:
     random = np.random.default_rng(0)
     flat = random.uniform(-1, 1, (40, 2))
     off = [
-        off_homography(anchors_of(pictures(np.hstack([flat, depth * random.normal(size=(40, 1))]), turns(20), 10.0)))
+        off_plane(pictures(np.hstack([flat, depth * random.normal(size=(40, 1))]), turns(20), 10.0))
         for depth in (0.01, 0.1, 0.5)
     ]
     assert 1e-4 < off[0] < 0.3 * off[1] < 0.3 * off[2]
@@ -53,9 +52,9 @@ def test_frames_with_too_few_common_points_are_ignored() -> None:
     points[5] = np.random.default_rng(1).normal(size=(30, 2))
     seen = np.ones((6, 30), dtype=bool)
     seen[5, FEWEST_COMMON - 1 :] = False
-    assert off_homography(anchors_of(points, seen)) < 1e-9
+    assert off_homography(points, seen) < 1e-9
     seen[:, FEWEST_COMMON - 1 :] = False
-    assert off_homography(anchors_of(points, seen)) == np.inf
+    assert off_homography(points, seen) == np.inf
 
 
 def test_coincident_points_are_neither_planar_nor_an_error() -> None:
@@ -94,9 +93,9 @@ def test_a_rigid_solid_is_not_a_sheet_although_it_preserves_lengths() -> None:
 def test_a_long_film_is_compared_at_a_fixed_number_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     compared: list[int] = []
 
-    def off(anchors: Anchors) -> float:
-        compared.append(len(anchors.seen))
-        return off_homography(anchors)
+    def off(points: np.ndarray, seen: np.ndarray) -> float:
+        compared.append(len(seen))
+        return off_homography(points, seen)
 
     monkeypatch.setattr(surface, "off_homography", off)
     verdict = isometric_surface(rolled_sheet(40, bend=(0.2, 0.8)).tracks, image_size=SIZE)

@@ -12,7 +12,7 @@ from pliant.solver.evaluation.metrics import reprojection
 from pliant.solver.evaluation.trust import per_frame
 from pliant.solver.isometry import focal_sweep
 from pliant.solver.isometry.anchors import Anchors, connected, nearest_neighbours
-from pliant.solver.isometry.extension import complete_anchors, extend, flatten, spline
+from pliant.solver.isometry.extension import complete_anchors, extend, flatten, share_of_track, spline
 from pliant.solver.isometry.focal_sweep import FocalSearch, Tried
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import (
@@ -24,9 +24,10 @@ from pliant.solver.isometry.refinement import (
     residuals,
     typical,
 )
-from pliant.solver.isometry.surface import isometric_surface
+from pliant.solver.isometry.surface import IsometricSurface, isometric_surface
 from pliant.solver.model.so3 import exponential
 from pliant.solver.pulse import never
+from pliant.solver.tracks.noise import RAYLEIGH_MEDIAN
 from rolled_sheets import CENTRE, FOCAL, SIZE, one_scale_error, rolled
 
 SMALL = {"frames": 6, "side": 7}
@@ -38,15 +39,18 @@ TINY = {"frames": 5, "side": 6}
 def graph_of(frames: int = 5, side: int = 5) -> tuple[SurfaceGraph, np.ndarray]:
     """Exact rays of a cylinder, and its true depths."""
     sheet = rolled(frames=frames, side=side)
-    anchors = Anchors(sheet.tracks.points, sheet.tracks.visible > 0, 0.0)
-    rays = np.concatenate([(anchors.points - CENTRE) / FOCAL, np.ones((*anchors.seen.shape, 1))], axis=2)
-    return SurfaceGraph(rays, anchors.seen, nearest_neighbours(anchors, neighbours=8)), sheet.points[..., 2]
+    points, confidence = sheet.tracks.points, np.asarray(sheet.tracks.visible)
+    rays = np.concatenate([(points - CENTRE) / FOCAL, np.ones((*confidence.shape, 1))], axis=2)
+    return SurfaceGraph(rays, confidence, nearest_neighbours(points, confidence > 0, neighbours=8)), sheet.points[
+        ..., 2
+    ]
 
 
 def test_the_jacobian_matches_finite_differences() -> None:
     graph, depths = graph_of()
-    seen = np.random.default_rng(0).random(graph.seen.shape) < 0.8
-    graph = replace(graph, seen=seen)
+    random = np.random.default_rng(0).random(graph.seen.shape)
+    seen = random < 0.8
+    graph = replace(graph, confidence=np.where(seen, 0.2 + random, 0.0))
     x = np.concatenate([np.log(depths[seen]), np.random.default_rng(1).random(len(graph.edges))])
     count = int(seen.sum())
     jacobian = residuals(graph, x[:count], x[count:])[1].toarray()
@@ -64,7 +68,7 @@ def test_a_step_solves_the_damped_normal_equations() -> None:
         np.arange(seen.shape[1]) == 4,
         False,
     )  # a hidden frame, a single point, a hidden point
-    graph = replace(graph, seen=seen)
+    graph = replace(graph, confidence=seen.astype(float))
     count = int(graph.seen.sum())
     left, jacobian = residuals(graph, np.log(depths[graph.seen]), 1.1 * typical(edge_lengths(graph, depths)))
     weighted = (jacobian.multiply(np.random.default_rng(1).uniform(0.1, 1, len(left))[:, None])).tocsr()
@@ -91,7 +95,7 @@ def with_inconsistencies(monkeypatch: pytest.MonkeyPatch, of_focal: Callable[[fl
 
 
 SEARCH = FocalSearch(
-    Anchors(np.ones((2, 3, 2)), np.ones((2, 3), bool), 0.0),
+    Anchors(np.ones((2, 3, 2)), np.ones((2, 3)), 0.0, False),
     edges=np.zeros((1, 2), np.intp), seen=np.ones((2, 3), bool), frames=np.arange(2), centre=np.zeros(2), should_stop=never,
 )  # fmt: skip
 
@@ -176,7 +180,7 @@ def test_refinement_recovers_the_true_depths_of_a_rigid_plane() -> None:
     ]
     points = np.array([plane @ turn.T + [0, 0, 4] for turn in turns])
     edges = np.array([(i, j) for i in range(25) for j in range(i) if np.hypot(*(sheet.flat[i] - sheet.flat[j])) < 0.75])
-    graph = SurfaceGraph(points / points[..., 2:], np.ones((4, 25), dtype=bool), edges)
+    graph = SurfaceGraph(points / points[..., 2:], np.ones((4, 25)), edges)
     assert inconsistency(edge_lengths(graph, points[..., 2])) < 1e-12
     moved = points[..., 2] * (1 + 0.02 * np.random.default_rng(0).standard_normal((4, 25)))
     found = refine(graph, moved, iterations=60)
@@ -186,6 +190,76 @@ def test_refinement_recovers_the_true_depths_of_a_rigid_plane() -> None:
     assert refine(graph, moved, should_stop=lambda: True).depths == pytest.approx(moved)
 
 
+def test_the_variance_of_a_length_is_the_sum_of_those_of_its_ends() -> None:
+    graph, _ = graph_of(frames=3)
+    confidence = np.random.default_rng(0).uniform(0.1, 1.0, graph.seen.shape)
+    confidence[1, :3] = 0.0
+    weighted = replace(graph, confidence=confidence)
+    frame, edge = weighted.pairs
+    first, second = graph.edges[edge].T
+    expected = 0.5 / confidence[frame, first] + 0.5 / confidence[frame, second]
+    np.testing.assert_allclose(1 / weighted.weights, expected)
+    np.testing.assert_array_equal(graph.weights, 1.0)
+
+
+def test_refinement_trusts_confident_anchors_more() -> None:
+    sheet = rolled(frames=12, side=6)
+    random = np.random.default_rng(0)
+    poor = random.random(sheet.tracks.visible.shape) < 0.5
+    points = sheet.tracks.points + random.normal(size=sheet.tracks.points.shape) * np.where(poor, 2.5, 0.1)[..., None]
+    rays = np.concatenate([(points - CENTRE) / FOCAL, np.ones((*poor.shape, 1))], axis=2)
+    edges = nearest_neighbours(points, np.ones_like(poor), neighbours=8)
+    depths = sheet.points[..., 2]
+
+    def error(confidence: np.ndarray) -> float:
+        found = refine(SurfaceGraph(rays, confidence, edges), depths, iterations=60).depths
+        return float(np.abs(found / found.mean() - depths / depths.mean())[~poor].mean())
+
+    assert error(np.where(poor, (0.1 / 2.5) ** 2, 1.0)) < 0.8 * error(np.ones_like(depths))
+
+
+def test_noise_of_dense_tracks_is_averaged_with_the_surface_and_confidences_are_weights() -> None:
+    sheet = rolled(frames=6, side=24)
+    random = np.random.default_rng(0)
+    poor = random.random(sheet.tracks.visible.shape) < 0.5
+    noise = random.normal(size=sheet.tracks.points.shape) * np.where(poor, 3.0, 1.0)[..., None]
+
+    def found(confidence: np.ndarray) -> IsometricSurface:
+        tracks = Tracks.from_arrays(sheet.tracks.points + noise, confidence)
+        surface = isometric_surface(tracks, focal=FOCAL, image_size=SIZE, required=True).surface
+        assert surface is not None
+        return surface
+
+    weighted, alike = found(np.where(poor, 1 / 9, 1.0)), found(np.ones(poor.shape))
+    assert one_scale_error(weighted.points, sheet.points) < 0.9 * one_scale_error(alike.points, sheet.points)
+    assert weighted.noise_std < 1.1  # that of full confidence; patches also fit some of the noise
+    images = FOCAL * weighted.points[..., :2] / weighted.points[..., 2:] + np.asarray(CENTRE)
+    off = np.linalg.norm(images - sheet.tracks.points, axis=2)
+    assert np.median(off) < 0.7 * np.median(np.linalg.norm(noise, axis=2))
+    half = found(np.where(poor, 1 / 18, 0.5))  # only ratios count
+    np.testing.assert_allclose(half.points, weighted.points, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("noise", "off", "expected"),
+    [
+        (1.0, 2.0, [3 / 4, 0.75 / 1.75, 0.0]),  # the surface's own variance is 2² − 1
+        (0.0, 2.0, [1.0, 1.0, 1.0]),
+        (2.0, 1.0, [0.0, 0.0, 0.0]),  # nothing but noise
+        (0.0, 0.0, [1.0, 1.0, 1.0]),
+    ],
+)
+def test_tracks_and_the_surfaces_image_are_weighted_by_inverse_variances(
+    noise: float, off: float, expected: list[float]
+) -> None:
+    confidence = np.array([[1.0, 0.25, 0.0]])
+    share = share_of_track(np.full(5, off * RAYLEIGH_MEDIAN), confidence, noise)
+    np.testing.assert_allclose(share, [expected])
+    np.testing.assert_array_equal(
+        share_of_track(np.zeros(0), confidence, 1.0), 0.0
+    )  # no observation lies on the surface
+
+
 def test_maximum_depth_satisfies_the_cones_and_approximates_the_sheet() -> None:
     graph, depths = graph_of()
     found = maximum_depth(graph)
@@ -193,7 +267,7 @@ def test_maximum_depth_satisfies_the_cones_and_approximates_the_sheet() -> None:
     assert one_scale_error(found[..., None] * graph.rays, depths[..., None] * graph.rays) < 0.12
     longest = np.nanmax(edge_lengths(graph, found), axis=0)
     assert longest.sum() == pytest.approx(1.0, rel=1e-2)  # d_ij are the longest of the frames where they bind
-    hidden = replace(graph, seen=np.zeros_like(graph.seen))
+    hidden = replace(graph, confidence=np.zeros_like(graph.confidence))
     assert maximum_depth(hidden) is None
     assert maximum_depth(graph, should_stop=lambda: True) is None
 
@@ -432,8 +506,9 @@ def test_the_dense_extension_does_not_depend_on_where_the_sheet_lies_in_the_pict
 
     def extended(moved: np.ndarray) -> np.ndarray:
         found = extend(
-            images + moved, seen, images=images[:, anchors] + moved, known=seen[:, anchors], anchors=spatial[:, anchors],
+            images + moved, seen.astype(float), images=images[:, anchors] + moved, known=seen[:, anchors], anchors=spatial[:, anchors],
             template=template - template.mean(axis=0), focal=FOCAL, centre=np.asarray(CENTRE) + moved,
+            noise_std=0.1,
         )  # fmt: skip
         assert found.outliers[wrong].mean() > 0.8
         return found.points
