@@ -19,10 +19,13 @@ ANY = (Candidate(0.0, np.inf),)
 
 @pytest.fixture(scope="module")
 def hinge() -> tuple[Floats, Perspective]:
-    """Rotations, and views in perspective of a box whose right end turns about a hinge, by up to 30°."""
+    """Rotations, and views in perspective of a box whose right end turns about a hinge, by up to 23°.
+
+    If it turns by 30°, two solutions 4° apart are about equally probable, and which one is found depends on the processor's rounding.
+    """
     random = np.random.default_rng(0)
     box = random.uniform(-1, 1, (60, 3)) * np.array([1.0, 0.6, 0.6])
-    angles = 0.5 * np.sin(np.linspace(0, 5, FRAMES))
+    angles = 0.4 * np.sin(np.linspace(0, 5, FRAMES))
     pivot = np.array([0.5, 0.0, 0.0])
     turned = (box - pivot) @ exponential(angles[:, None] * np.array([0.0, 0.3, 1.0])).transpose(0, 2, 1) + pivot
     shapes = np.where(box[:, :1] > 0.5, turned, box)
@@ -72,7 +75,7 @@ def test_the_result_hardly_depends_on_the_other_cameras(
     one, two = found_from(hinge, 0.0), unknown
     every = np.arange(FRAMES)
     apart = angles_between(aligned(two[0].rotations, one[0].rotations, every), one[0].rotations)
-    assert np.degrees(apart).max() < 2
+    assert np.degrees(apart).max() < 0.5
     assert one[1] == two[1]
 
 
