@@ -34,6 +34,8 @@ class AsyncConnection:
         event_hooks: Mapping[str, list[Callable[..., Any]]] | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
+        if not isinstance(retries, Retry):
+            raise BadArgument(f"retries: expected a Retry, such as Retry(patience=10), got {retries!r}.")
         self.url = base_of(url if url is not None else os.environ.get("PLIANT_URL") or DEFAULT_URL)
         bearer = token if token is not None else os.environ.get("PLIANT_TOKEN") or None
         self._http = httpx.AsyncClient(
