@@ -19,7 +19,7 @@ from pliant.worker.execution.workdir import output_tail
 from pliant.worker.ids import new_attempt_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.processes.containment import OomKills
-from pliant.worker.records import Records, Stored
+from pliant.worker.records import Records, Stored, dated
 from pliant.worker.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -143,7 +143,7 @@ def finalize(watch: Watch, *, status: int, peak: int, deadline: RetryDeadline) -
     """
     change = _verdict(watch, status=status, peak=peak)
     sentence = f"Ended by the worker: {watch.reason}." if watch.reason is not None else how_it_ended(status)
-    words = [sentence, *output_tail(watch.settings, watch.attempt_id)]
+    words = [*dated(sentence), *output_tail(watch.settings, watch.attempt_id)]
 
     def record_verdict() -> Stored:
         change(watch.records.get(watch.id))  # raises if the outcome is recorded already

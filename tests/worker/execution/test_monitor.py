@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 import signal
 import threading
 from collections.abc import Callable
@@ -349,5 +350,5 @@ def test_the_log_is_complete_before_the_record_is_final(
 
     monkeypatch.setattr(type(jobs.records), "update", seen)
     assert finalize(watch, status=KILLED, peak=0, deadline=RetryDeadline(0)) is not None
-    assert "SIGKILL" in logged[0]
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ .*SIGKILL.*", logged[0])
     assert logged[1:] == ["Segmentation fault"] == jobs.records.log(watch.id)[1:]
