@@ -131,6 +131,10 @@ def test_a_film_chosen_as_tracks_moves_to_the_film_input(page: Page) -> None:
     expect(page.locator("[data-part=film]")).to_contain_text("clip.mp4")
     expect(page.locator("[data-part=tracks]")).to_be_hidden()
     expect(page.locator("[data-part=film]").get_by_role("alert")).to_be_visible(timeout=SOON)
+    expect(page.get_by_text("Not read: see “Film” above.")).to_be_visible()  # nothing was submitted
+    expect(page.get_by_role("button", name="Choose a mask picture")).to_be_hidden()  # nor will its first frame come
+    page.get_by_role("button", name="Remove film").click()
+    expect(page.get_by_text("Not read")).to_be_hidden()
 
 
 @pytest.mark.usefixtures("front")
