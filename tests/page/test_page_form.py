@@ -165,7 +165,8 @@ def test_a_finished_job_can_be_exported_shared_and_rerun(page: Page, url: str, f
     page.get_by_role("button", name="Create a link").click()
     link = page.get_by_label("Link to this result").input_value()
     assert link.startswith(f"{url}/#share=share.{finished}.")
-    guest = page.context.new_page()
+    guest, refused = page.context.new_page(), list[str]()
+    guest.on("response", lambda response: refused.append(response.url) if response.status >= 400 else None)
     guest.goto(link)
     expect(guest.get_by_text("This is a shared, read-only result.")).to_be_visible()
     expect(guest.get_by_role("heading", name="a finished face")).to_be_visible()
@@ -173,6 +174,7 @@ def test_a_finished_job_can_be_exported_shared_and_rerun(page: Page, url: str, f
     expect(guest.get_by_role("button", name="Reconstruct")).to_be_hidden()
     expect(guest.locator(".view canvas").first).to_be_visible(timeout=SOON)
     assert axe_findings(guest) == []
+    assert refused == [], "the page asks for nothing that the link does not allow"
     newest = httpx.get(f"{url}/v1/jobs/{finished}/shares").json()[-1]["id"]  # other links may exist
     of_the_link = page.get_by_role("listitem").filter(has_text=f"Link {newest},")
     of_the_link.get_by_role("button", name="Revoke").click()
