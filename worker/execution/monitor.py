@@ -14,7 +14,14 @@ from typing import TypeVar
 
 from pliant.schemas.job import Problem, Status
 from pliant.worker.errors import StaleAttempt, StoreUnavailable, TimedOut, UnknownJob
-from pliant.worker.execution.failures import how_it_ended, out_of_memory, problem_of, timed_out, worker_lost
+from pliant.worker.execution.failures import (
+    how_it_ended,
+    out_of_memory,
+    problem_of,
+    timed_out,
+    was_unrecorded,
+    worker_lost,
+)
 from pliant.worker.execution.workdir import output_tail
 from pliant.worker.ids import new_attempt_id
 from pliant.worker.jobs import lifecycle
@@ -167,16 +174,16 @@ def _verdict(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stor
             raise StaleAttempt(watch.id)
         if watch.reason is Reason.CANCELLED:
             return lifecycle.stop(stored, attempt_id=attempt_id, now=now, retention=settings.retention)
-        if watch.reason is Reason.STOPPING or (watch.reason is None and watch.stopping and _was_killed(status)):
-            problem = worker_lost("The worker was shut down.")
-            fresh = new_attempt_id(watch.id)
+        stopped = watch.reason is Reason.STOPPING or (watch.reason is None and watch.stopping and _was_killed(status))
+        # An outage of the store is no fault of the job: it is repeated, as it is by the reconciler when the outage lasts longer.
+        if stopped or (watch.reason is None and was_unrecorded(status)):
             return lifecycle.requeue(
                 stored,
                 attempt_id=attempt_id,
-                fresh=fresh,
-                problem=problem,
+                fresh=new_attempt_id(watch.id),
+                problem=worker_lost("The worker was shut down." if stopped else how_it_ended(status)),
                 now=now,
-                max_attempts=None,
+                max_attempts=None if stopped else settings.max_attempts,
                 retention=settings.retention,
             )
         if watch.reason is Reason.TIMED_OUT:
