@@ -243,11 +243,11 @@ class BadBackup(WorkerError):
 
 
 class ServerFailed(WorkerError):
-    """The embedded Valkey cannot be started."""
+    """The embedded Valkey or the API cannot be started."""
 
     code = "server_failed"
 
-    def __init__(self, sentence: str, *, log: str) -> None:
+    def __init__(self, sentence: str, *, log: str = "") -> None:
         super().__init__(f"{sentence} Its log ends with: {log}" if log else sentence)
 
 
