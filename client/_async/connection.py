@@ -16,6 +16,10 @@ from pliant.client.retry import Attempts, Contact, Retry
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 
+UNLIMITED = httpx.Limits(max_connections=None, max_keepalive_connections=20)
+"""As many connections as the program has calls under way: a wait or an event stream holds one, and beyond httpx's 100 others would
+starve. Idle connections are kept as by default."""
+
 
 class AsyncConnection:
     """Base class of `AsyncClient`, which documents the parameters. Close it, or use it in a ``with`` block."""
@@ -42,6 +46,7 @@ class AsyncConnection:
             base_url=self.url,
             headers=headers_of(bearer, headers),
             verify=verify,
+            limits=UNLIMITED,
             event_hooks=event_hooks,
             transport=transport,
         )
