@@ -228,18 +228,21 @@ def until_ready(url: str) -> Callable[[subprocess.Popen[bytes]], None]:
 
     Raises
     ------
+    ServerFailed
+        The process ended.
     Unreachable
-        The process ended, or was not ready in time.
+        It was not ready in time.
     """
 
     def wait(process: subprocess.Popen[bytes]) -> None:
         from pliant.client.errors import Unreachable
+        from pliant.worker.errors import ServerFailed
 
         reason = "it did not answer"
         deadline = time.monotonic() + READY_WITHIN
         while time.monotonic() < deadline:
             if process.poll() is not None:
-                raise Unreachable(f"The service ended with code {process.returncode}; see its last lines above.")
+                raise ServerFailed(f"The service ended with code {process.returncode}; the lines above state why.")
             try:
                 reason = _why_not_ready(url)
             except (OSError, http.client.HTTPException, ValueError) as fault:

@@ -7,7 +7,6 @@ import re
 import shutil
 import zipfile
 from collections.abc import Mapping
-from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -102,11 +101,12 @@ def mesh_part(mesh: Source | tuple[int, int], folder: Path) -> Path | str:
         return text
     if isinstance(mesh, str | Path):
         return existing_file(mesh, "mesh")
-    if isinstance(mesh, tuple) and len(mesh) == 2 and all(isinstance(size, Integral) for size in mesh):
-        return f"{mesh[0]}x{mesh[1]}"
     if isinstance(mesh, Mapping):
         return _npz(folder / "mesh.npz", {str(key): _array(value, str(key)) for key, value in mesh.items()})
-    return _npz(folder / "mesh.npz", {"faces": _array(mesh, "mesh")})
+    faces = _array(mesh, "mesh")
+    if faces.shape == (2,) and faces.dtype.kind in "iu":  # a tuple, a list or an array; faces have two axes
+        return f"{faces[0]}x{faces[1]}"
+    return _npz(folder / "mesh.npz", {"faces": faces})
 
 
 def mesh_text(mesh: str) -> str | None:
@@ -180,6 +180,21 @@ def expanded(path: Path | str, name: str) -> Path:
         ) from None
 
 
+def folder_to_fill(path: Path | str, name: str) -> Path:
+    """Return the path of a folder for files, which need not exist yet, with ``~`` expanded.
+
+    Raises
+    ------
+    BadArgument
+        There is no such user, or the path is that of a file, or below one.
+    """
+    found = expanded(path, name)
+    there = next((each for each in (found, *found.parents) if each.exists()), None)
+    if there is not None and not there.is_dir():
+        raise BadArgument(f"{name}: expected a folder, got the file {there}. Choose another folder.")
+    return found
+
+
 def job_name(of_file: str) -> str:
     """Return the name of a job for a file name: valid UTF-8, truncated to `LONGEST_NAME` characters."""
     return of_file.encode("utf-8", "replace").decode()[:LONGEST_NAME]
@@ -217,7 +232,7 @@ def _array(value: Any, name: str) -> NDArray[np.generic]:
         array = np.asarray(None)
     if array.dtype == object and not hasattr(value, "dtype"):
         raise BadArgument(
-            f"{name}: expected an array of numbers or booleans, got {kind_of(value)} that is none. "
+            f"{name}: expected an array of numbers or booleans, got {kind_of(value)}, which cannot be converted. "
             "Pad ragged lists with NaN, and give files by their path."
         )
     if array.dtype.kind not in "biuf":

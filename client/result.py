@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 from pliant.client.errors import BadArgument, JobCancelled, JobFailed, NotAllowedNow, NotFound, NotLoaded
-from pliant.client.input_files import expanded
+from pliant.client.input_files import expanded, folder_to_fill
 from pliant.schemas.job import Job, Problem, Status
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class Reconstruction:
             self._kept = TemporaryFolder()
             self.folder = self._kept.path
         else:
-            self.folder = expanded(folder, "folder")
+            self.folder = folder_to_fill(folder, "folder")
 
     def __getstate__(self) -> dict[str, Any]:
         files = {"arrays": ARRAYS, "report": REPORT}

@@ -58,8 +58,17 @@ def verified(
     InvalidSignature
         The message is forged, altered or too old.
     BadArgument
-        The secret is malformed or empty.
+        The secret is malformed, empty or missing, or the body is not bytes.
     """
+    if not isinstance(body, bytes | bytearray | memoryview):
+        raise BadArgument(
+            f"body: expected the bytes of the request, got a value of type {type(body).__name__}. "
+            "Pass the body as it arrived, before it is decoded or parsed."
+        )
+    if not isinstance(secret, str):
+        raise BadArgument(
+            f"secret: expected the value passed as webhook_secret, got a value of type {type(secret).__name__}."
+        )
     try:
         key = base64.b64decode(secret.removeprefix(PREFIX), validate=True)
     except (binascii.Error, ValueError):
@@ -76,7 +85,7 @@ def verified(
         raise InvalidSignature(f"The message has no header {missing}: it is not from Pliant. Discard it.") from None
     if not moment.isascii() or not moment.isdigit():
         raise InvalidSignature("The message's webhook-timestamp is not a number: it is not from Pliant. Discard it.")
-    wanted = hmac.new(key, f"{name}.{moment}.".encode() + body, hashlib.sha256).digest()
+    wanted = hmac.new(key, f"{name}.{moment}.".encode() + bytes(body), hashlib.sha256).digest()
     right = f"v1,{base64.b64encode(wanted).decode()}".encode()
     if not any(hmac.compare_digest(each.encode(), right) for each in signatures.split(" ")):
         raise InvalidSignature(
@@ -84,11 +93,12 @@ def verified(
         )
     age = (time.time() if now is None else now) - int(moment)
     if abs(age) > tolerance:
+        when = f"{age:.0f} s ago" if age > 0 else f"{-age:.0f} s in the future, by this machine's clock"
         raise InvalidSignature(
-            f"The message was signed {age:.0f} s ago, more than {tolerance:.0f} s. Discard it: it may be a replay."
+            f"The message was signed {when}, more than {tolerance:.0f} s. Discard it: it may be a replay."
         )
     try:
-        return Job.model_validate(json.loads(body)["data"])
+        return Job.model_validate(json.loads(bytes(body))["data"])
     except (ValueError, KeyError, TypeError, ValidationError) as fault:
         raise InvalidSignature(
             "The message is signed but contains no job. It may come from another service."

@@ -69,13 +69,13 @@ class Problem(Record):
         default_factory=lambda given: type_of(given.get("code", "")),
         description="Reference to the explanation of the code.",
     )
-    field: str | None = Field(None, description="The invalid input, e.g. `tracks` or `options.loss`.")
-    expected: str | None = Field(None, description="What the input should be.")
-    got: str | None = Field(None, description="What it is.")
-    hint: str | None = Field(None, description="What to do.")
-    retryable: bool = Field(False, description="True if the same request may succeed later.")
+    field: str | None = Field(default=None, description="The invalid input, e.g. `tracks` or `options.loss`.")
+    expected: str | None = Field(default=None, description="What the input should be.")
+    got: str | None = Field(default=None, description="What it is.")
+    hint: str | None = Field(default=None, description="What to do.")
+    retryable: bool = Field(default=False, description="True if the same request may succeed later.")
     choices: list[dict[str, Any]] | None = Field(
-        None, description="The possible interpretations of an ambiguous input."
+        default=None, description="The possible interpretations of an ambiguous input."
     )
 
     @classmethod
@@ -119,14 +119,14 @@ class Progress(Record):
         description="`track` (films), `loading`, `cameras`, `initialise`, `reweight`, `finish` or `exporting`."
     )
     fraction: float = Field(ge=0, le=1, description="Completed share of the job, estimated.")
-    reweighting: int = Field(0, description="Number of finished reweightings of the robust loss.")
-    max_reweightings: int = Field(0, description="Maximum number of reweightings.")
+    reweighting: int = Field(default=0, description="Number of finished reweightings of the robust loss.")
+    max_reweightings: int = Field(default=0, description="Maximum number of reweightings.")
     objective: float | None = Field(
-        None, description="Objective of the solve, normalized units; null before the first shapes."
+        default=None, description="Objective of the solve, normalized units; null before the first shapes."
     )
-    residual: float | None = Field(None, description="Median visible reprojection residual, the tracks' unit.")
-    seconds_left: float | None = Field(None, description="Estimate; null until one is possible.")
-    followed: FollowedPoints | None = Field(None, description="Points that the stage `track` tracked last.")
+    residual: float | None = Field(default=None, description="Median visible reprojection residual, the tracks' unit.")
+    seconds_left: float | None = Field(default=None, description="Estimate; null until one is possible.")
+    followed: FollowedPoints | None = Field(default=None, description="Points that the stage `track` tracked last.")
     updated_at: datetime = Field(description="When this was reported.")
 
 
@@ -137,7 +137,7 @@ class Artifact(Record):
     media_type: str = Field(description="Media type, e.g. `model/gltf-binary`.")
     bytes: int = Field(description="Size.")
     sha256: str = Field(description="SHA-256 of the file, 64 hexadecimal digits.")
-    description: str = Field("", description="What it contains, in a sentence.")
+    description: str = Field(default="", description="What it contains, in a sentence.")
 
 
 class Estimate(Record):
@@ -156,7 +156,7 @@ class Interpretation(Record):
     hidden_fraction: float = Field(description="Share of the F·P observations with weight 0.")
     mesh_source: str = Field(description="`given`, `grid`, `delaunay`, `film` or `none`.")
     mesh_grid: tuple[int, int] | None = Field(
-        None, description="Rows and columns, if the points form a complete grid, row by row."
+        default=None, description="Rows and columns, if the points form a complete grid, row by row."
     )
     has_ground_truth: bool = Field(description="Whether true shapes were given, which error metrics need.")
     has_rotations: bool = Field(description="Whether cameras were given.")
@@ -164,26 +164,26 @@ class Interpretation(Record):
         description="How the track array was read, e.g. `tracks (F, P, 2)` or `W (2F, P), rows interleaved`."
     )
     format: str = Field(
-        "",
+        default="",
         description="Program whose format was recognised, e.g. `CoTracker`; else `canonical`, `matrix` or `unnamed`.",
     )
     coordinates: str = Field(
-        "pixels",
+        default="pixels",
         description="Original coordinates: `pixels` (or another common unit), `unit` or `signed` fractions of the picture, or `projected`.",
     )
-    y_axis: str = Field("down", description="`down` (pixels) or `up`.")
+    y_axis: str = Field(default="down", description="`down` (pixels) or `up`.")
     image_size: str | None = Field(
-        None,
+        default=None,
         description="WIDTHxHEIGHT of the picture where the input states it, as films and files of `pliant track` do; used unless the "
         "options give another.",
     )
     fps: float | None = Field(
-        None, description="Frames per second where the input states them; used unless the options give others."
+        default=None, description="Frames per second where the input states them; used unless the options give others."
     )
-    given_frames: int | None = Field(None, description="Frames in the file, of which `num_frames` are used.")
-    given_points: int | None = Field(None, description="Points in the file, of which `num_points` are used.")
+    given_frames: int | None = Field(default=None, description="Frames in the file, of which `num_frames` are used.")
+    given_points: int | None = Field(default=None, description="Points in the file, of which `num_points` are used.")
     num_left_out: int = Field(
-        0,
+        default=0,
         description="Points visible in too few frames and excluded; they keep their index and follow their neighbours on the mesh.",
     )
     left_out_points: list[int] = Field(
@@ -191,7 +191,7 @@ class Interpretation(Record):
     )
     notes: list[str] = Field(default_factory=list, description="Sentences with evidence, exclusions and assumptions.")
     estimate: Estimate | None = Field(
-        None,
+        default=None,
         description="Memory and time of the reconstruction; null for films that are not tracked yet, whose points are unknown.",
     )
 
@@ -205,7 +205,7 @@ class Inspection(Interpretation):
         description="Some points in some frames, for a picture: x and y in turn, 0 to 1000, y down; -1 twice where hidden.",
     )
     first_frame: str | None = Field(
-        None,
+        default=None,
         repr=False,
         description="First frame of a film, for a picture: a JPEG in base64, at most 800 pixels a side; `image_size` states the film's own "
         "pixels. Null for tracks.",
@@ -217,46 +217,51 @@ class Job(Record):
     """A reconstruction job."""
 
     id: str = Field(description="3 to 64 letters, digits, underscores or dashes.")
-    name: str = Field("", description="Label chosen by the user.")
+    name: str = Field(default="", description="Label chosen by the user.")
     status: Status = Field(description="Status of the job; `succeeded`, `failed` and `cancelled` are final.")
     created_at: datetime = Field(description="When it was submitted.")
-    started_at: datetime | None = Field(None, description="When its attempt began; null while it waits.")
-    finished_at: datetime | None = Field(None, description="When the status became final; null until then.")
-    expires_at: datetime | None = Field(None, description="When the job and its files are removed; null: never.")
-    attempt: int = Field(0, description="Number of attempts so far.")
-    retry_of: str | None = Field(None, description="The finished job that this one repeats.")
+    started_at: datetime | None = Field(default=None, description="When its attempt began; null while it waits.")
+    finished_at: datetime | None = Field(default=None, description="When the status became final; null until then.")
+    expires_at: datetime | None = Field(
+        default=None, description="When the job and its files are removed; null: never."
+    )
+    attempt: int = Field(default=0, description="Number of attempts so far.")
+    retry_of: str | None = Field(default=None, description="The finished job that this one repeats.")
     outputs_of: str | None = Field(
-        None, description="The finished job whose result this one writes in further files, without solving again."
+        default=None,
+        description="The finished job whose result this one writes in further files, without solving again.",
     )
     priority: Priority = Field(
-        "normal",
+        default="normal",
         description="`high`, `normal` or `low`: order among the waiting jobs of one owner; "
         "it does not put a job ahead of other owners' jobs.",
     )
-    place_in_queue: int | None = Field(None, description="Number of queued jobs ahead; null if not queued.")
+    place_in_queue: int | None = Field(default=None, description="Number of queued jobs ahead; null if not queued.")
     options: Options = Field(description="All options, also those that were not given.")
     interpretation: Interpretation = Field(description="How the inputs were read.")
-    progress: Progress | None = Field(None, description="Latest progress of its attempt; null before there is any.")
+    progress: Progress | None = Field(
+        default=None, description="Latest progress of its attempt; null before there is any."
+    )
     metrics: dict[str, float] | None = Field(
-        None, description="Every error metric for which the inputs suffice, by its documented name."
+        default=None, description="Every error metric for which the inputs suffice, by its documented name."
     )
     outcome: str | None = Field(
-        None, description="Outcome of the solver: `converged`, `max_reweightings` or `rejected`."
+        default=None, description="Outcome of the solver: `converged`, `max_reweightings` or `rejected`."
     )
-    sentence: str | None = Field(None, description="The outcome as a sentence.")
+    sentence: str | None = Field(default=None, description="The outcome as a sentence.")
     verdict: Literal["good", "with_care", "do_not_use"] | None = Field(
-        None, description="Whether the result can be used, estimated without ground truth; null: no verdict."
+        default=None, description="Whether the result can be used, estimated without ground truth; null: no verdict."
     )
     verdict_reasons: list[str] = Field(
         default_factory=list,
         description="A sentence with a figure for each reason against the result, most severe first.",
     )
     trust_sentence: str | None = Field(
-        None, description="A sentence with the expected error and the evidence for depth."
+        default=None, description="A sentence with the expected error and the evidence for depth."
     )
     warnings: list[str] = Field(default_factory=list, description="Warnings about this result.")
     artifacts: list[Artifact] = Field(default_factory=list, description="Result files; empty until the job succeeds.")
-    error: Problem | None = Field(None, description="Why the job failed; null unless it did.")
+    error: Problem | None = Field(default=None, description="Why the job failed; null unless it did.")
 
     @field_validator("options", mode="before")
     @classmethod
@@ -272,17 +277,19 @@ class Upload(Record):
 
     id: str = Field(description="The id in the upload's address.")
     offset: int = Field(description="Bytes received.")
-    length: int | None = Field(None, description="Bytes of the complete upload; null while unknown.")
+    length: int | None = Field(default=None, description="Bytes of the complete upload; null while unknown.")
     complete: bool = Field(description="True once all bytes are received; only then can a job use it.")
-    sha256: str | None = Field(None, description="Digest of the complete upload; null until it is complete.")
-    expires_at: datetime | None = Field(None, description="When it is removed unless it is used before; null: never.")
+    sha256: str | None = Field(default=None, description="Digest of the complete upload; null until it is complete.")
+    expires_at: datetime | None = Field(
+        default=None, description="When it is removed unless it is used before; null: never."
+    )
 
 
 class JobPage(Record):
     """One page of jobs, newest first."""
 
     jobs: list[Job] = Field(description="Jobs of this page.")
-    next: str | None = Field(None, description="Pass as `cursor` to get the next page; null at the end.")
+    next: str | None = Field(default=None, description="Pass as `cursor` to get the next page; null at the end.")
 
 
 class ServiceLimits(Record):
@@ -290,7 +297,9 @@ class ServiceLimits(Record):
 
     max_body_bytes: int = Field(description="Largest body of one request.")
     max_text_bytes: int = Field(description="Largest text field of a form.")
-    max_upload_bytes: int = Field(0, description="Largest upload, over all its requests; 0: uploads are not available.")
+    max_upload_bytes: int = Field(
+        default=0, description="Largest upload, over all its requests; 0: uploads are not available."
+    )
     max_bytes: int = Field(description="Largest file, and all arrays read from it, inflated.")
     max_frames: int = Field(description="Most frames of one input.")
     max_points: int = Field(description="Most points of one input.")
@@ -299,9 +308,11 @@ class ServiceLimits(Record):
     max_wait_seconds: int = Field(description="Maximum n of `Prefer: wait=n`.")
     max_page: int = Field(description="Maximum number of jobs on one page.")
     max_queued: int = Field(
-        0, description="Maximum number of your queued jobs, above which submissions fail with 429; 0: no limit."
+        default=0, description="Maximum number of your queued jobs, above which submissions fail with 429; 0: no limit."
     )
-    max_running: int = Field(0, description="Maximum number of your running jobs, the others wait; 0: no limit.")
+    max_running: int = Field(
+        default=0, description="Maximum number of your running jobs, the others wait; 0: no limit."
+    )
     requests_per_minute: int = Field(
-        0, description="Maximum number of requests per minute, above which requests fail with 429; 0: no limit."
+        default=0, description="Maximum number of requests per minute, above which requests fail with 429; 0: no limit."
     )

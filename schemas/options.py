@@ -104,178 +104,184 @@ class Options(Chosen):
     """Options of a reconstruction. Every option has a default; unknown names are rejected."""
 
     method: Literal["pseudo_inverse", "temporal", "spatio_temporal", "robust"] = Field(
-        "robust",
+        default="robust",
         description="pseudo_inverse: the shapes of smallest norm that fit the tracks. temporal: closed form with smoothness in time. "
         "spatio_temporal: smoothness in time and space, least squares. robust: in time and space, with a loss that resists outliers.",
     )
     camera: Literal["auto", "perspective", "scaled_orthographic", "orthographic"] = Field(
-        "auto",
+        default="auto",
         description="perspective: a pinhole camera. scaled_orthographic: no perspective, one scale per frame. orthographic: no scales. "
         "auto: perspective if the tracks are clearly more probable with it, else scaled_orthographic.",
     )
     focal: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)] | None = Field(
-        None, description="Focal length in pixels of the tracks; null: estimated for a perspective camera."
+        default=None, description="Focal length in pixels of the tracks; null: estimated for a perspective camera."
     )
     field_of_view: Annotated[float, Field(gt=0, lt=180, allow_inf_nan=False)] | None = Field(
-        None,
+        default=None,
         description="Horizontal angle of view in degrees, instead of focal: focal = width / (2 tan(angle / 2)). Needs image_size.",
     )
     principal_point: PointText | None = Field(
-        None,
+        default=None,
         description="Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, "
         "((width - 1) / 2, (height - 1) / 2), or that of the tracks without it.",
     )
     surface: Literal["auto", "isometric", "free"] = Field(
-        "auto",
+        default="auto",
         description="isometric: a sheet that bends without stretching, such as paper or cloth, seen in perspective. free: no such "
         "assumption. auto: isometric if the tracks are those of a sheet and its edge lengths determine a focal length; "
         "needs image_size or focal.",
     )
     order: Literal["auto", "film", "any"] = Field(
-        "auto",
+        default="auto",
         description="film: neighbouring frames are alike. any: photographs in no order; results do not depend on it. "
         "Needs prior gaussian and at most 360 frames. auto: any if neighbouring frames are no more alike than others.",
     )
     basis_size: Annotated[int, Field(ge=1, le=100)] | None = Field(
-        None,
+        default=None,
         description="Number K of basis shapes in the factorization for the rotations; null: selected from the data.",
     )
-    refine_rotations: bool = Field(True, description="Refine the cameras by maximising the likelihood of the tracks.")
+    refine_rotations: bool = Field(
+        default=True, description="Refine the cameras by maximising the likelihood of the tracks."
+    )
     preset: Literal["auto", "paper"] = Field(
-        "auto",
+        default="auto",
         description="Source of weights that are not given. auto: measured from noise and motion. paper: the published setting.",
     )
     temporal_weight: Weight | None = Field(
-        None, description="λ1, weight of smoothness in time, dimensionless; null: the preset's."
+        default=None, description="λ1, weight of smoothness in time, dimensionless; null: the preset's."
     )
     spatial_weight: Weight | None = Field(
-        None, description="λ2, weight of smoothness along the surface, dimensionless; null: the preset's."
+        default=None, description="λ2, weight of smoothness along the surface, dimensionless; null: the preset's."
     )
     robust_scale: Annotated[float, Field(ge=1e-9, le=1e3, allow_inf_nan=False)] | None = Field(
-        None,
+        default=None,
         description="Residual at which the loss changes from quadratic to linear, in RMS radii of the tracks; null: the preset's.",
     )
     temporal_order: Literal[1, 2] | None = Field(
-        None, description="1 penalises velocity, 2 acceleration; null: the preset's. No effect with prior gaussian."
+        default=None,
+        description="1 penalises velocity, 2 acceleration; null: the preset's. No effect with prior gaussian.",
     )
-    loss: Literal["l1", "l2", "huber"] = Field("l1", description="Loss of the data term when method is robust.")
+    loss: Literal["l1", "l2", "huber"] = Field(default="l1", description="Loss of the data term when method is robust.")
     laplacian: Literal["auto", "grid8", "uniform", "cotangent"] = Field(
-        "auto",
+        default="auto",
         description="Spatial smoothness: 8-direction stencil on a pixel grid, or mesh Laplacian; auto: by the mesh given.",
     )
     prior: Literal["gaussian", "smooth+low_rank", "smooth"] = Field(
-        "gaussian",
+        default="gaussian",
         description="gaussian: a Gaussian over the frames for the positions of each point, learned from the tracks (method robust with "
         "preset auto; else smooth); smooth: the published method; smooth+low_rank also favours shapes that few basis shapes "
         "explain (with preset paper only if low_rank_weight is given).",
     )
     low_rank_weight: Weight | None = Field(
-        None,
+        default=None,
         description="λ3, weight of the low-rank prior, dimensionless; null: from the data. No effect unless prior is "
         "smooth+low_rank.",
     )
-    max_reweightings: int = Field(60, ge=1, le=1000, description="Maximum number of reweightings of the robust loss.")
+    max_reweightings: int = Field(
+        default=60, ge=1, le=1000, description="Maximum number of reweightings of the robust loss."
+    )
     tolerance: float = Field(
-        1e-4,
+        default=1e-4,
         gt=0,
         lt=1,
         description="Relative change of the objective over one reweighting below which the solve has converged.",
     )
     precision: Literal["float64", "float32"] = Field(
-        "float64", description="Precision of the large arrays; prior gaussian needs float64."
+        default="float64", description="Precision of the large arrays; prior gaussian needs float64."
     )
-    seed: int = Field(0, ge=0, lt=2**32, description="Seed of all random choices.")
+    seed: int = Field(default=0, ge=0, lt=2**32, description="Seed of all random choices.")
 
     time_limit: Annotated[float, Field(gt=0, le=604_800, allow_inf_nan=False)] | None = Field(
-        None,
+        default=None,
         description="Time limit of the job in seconds, after which it fails with timed_out; null: only the service's own limit.",
     )
     fps: float = Field(
-        25.0,
+        default=25.0,
         gt=0,
         le=1000,
         allow_inf_nan=False,
         description="Frames per second of the written animation. For a film, the default is its own rate.",
     )
     outputs: Outputs = Field(
-        ("glb", "ply", "csv"),
+        default=("glb", "ply", "csv"),
         description="Files to write besides shapes.npz, report.json and preview.bin. glb: animated glTF. ply, obj: a mesh per frame, in a "
         "zip. usd: USD with time samples. abc: Alembic. mdd: point cache for Blender, Maya and Houdini. mat: MATLAB. "
         "csv: metrics of every frame and of every point.",
     )
     normals: Literal["static", "animated", "none"] = Field(
-        "animated",
+        default="animated",
         description="animated: they move with the shape, in shapes.glb and in every frame of PLY, OBJ and USD. static: those of the "
         "first shape, in shapes.glb only. none: viewers compute their own.",
     )
     colours: Literal["none", "error", "expected_error"] = Field(
-        "none",
+        default="none",
         description="none: no colours. error: points are coloured by their distance from the ground truth, or by their reprojection "
         "residual where there is none. expected_error: by the error that the solver expects, in percent of the object's size; only "
         "prior gaussian estimates it. PLY, OBJ and USD are coloured in every frame, shapes.glb by the mean over frames.",
     )
     axes: Literal["tracks", "viewer"] = Field(
-        "viewer",
+        default="viewer",
         description="Axes of PLY and OBJ. viewer: y up, as in shapes.glb. tracks: those of the tracks, as in shapes.npz.",
     )
     glb_quantized: bool = Field(
-        False,
+        default=False,
         description="Write shapes.glb with 16-bit positions and 8-bit normals (KHR_mesh_quantization): about half the size, and rounded "
         "to a 65,000th of the largest extent and half a degree.",
     )
     glb_motion: Literal["auto", "frames"] = Field(
-        "auto",
+        default="auto",
         description="How shapes.glb stores the motion. auto: as few modes of motion as keep every point within a thousandth "
         "of the bounding box's diagonal. frames: one morph target per frame, exact in single precision, for up to 200 frames.",
     )
 
     layout: Literal["auto", "frames_points", "points_frames"] = Field(
-        "auto",
+        default="auto",
         description="Order of the track array's axes. auto: by the names in the file and by smoothness in time; an error if several fit.",
     )
     rows: Literal["auto", "interleaved", "stacked"] = Field(
-        "auto",
+        default="auto",
         description="Rows of a 2F × P matrix: interleaved x1, y1, x2, y2 … or stacked all x, then all y; auto: from the data.",
     )
     y_axis: Literal["auto", "down", "up"] = Field(
-        "auto",
+        default="auto",
         description="Direction of y. auto: down (pixels), or up if coordinates are centred on zero. Written meshes are always upright.",
     )
     coordinates: Literal["auto", "pixels", "unit", "signed"] = Field(
-        "auto",
+        default="auto",
         description="Unit of x and y. pixels: used unchanged, whatever their unit. unit: from 0 to 1, divided by (width − 1, "
         "height − 1). signed: from −1 to 1 likewise. auto: by the values; values within 0 … 1 without image_size are an error.",
     )
     image_size: SizeText | None = Field(
-        None,
+        default=None,
         description="WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed if coordinates are fractions of it. "
         "Pixel centres lie at whole numbers from 0. The picture's centre is the principal point of a perspective camera.",
     )
     coordinate_order: Literal["auto", "xy", "yx"] = Field(
-        "auto", description="Order of a point's two coordinates. auto: x, y, unless only y, x lies inside image_size."
+        default="auto",
+        description="Order of a point's two coordinates. auto: x, y, unless only y, x lies inside image_size.",
     )
     visibility: Literal["auto", "bool", "probability", "logits"] = Field(
-        "auto",
+        default="auto",
         description="Type of the visibility array. bool: not 0 is true. probability: from 0 to 1. logits: any number, 0 is undecided. "
         "auto: by the values. The name of the array determines whether it marks visible or hidden points.",
     )
     frames: SliceText | None = Field(
-        None, description="Frames to use, start:stop:step as in Python, e.g. 10:200:2; null: all."
+        default=None, description="Frames to use, start:stop:step as in Python, e.g. 10:200:2; null: all."
     )
     stride: int = Field(
-        1,
+        default=1,
         ge=1,
         le=1000,
         description="Use every n-th point: every n-th row and column of a pixel grid, else every n-th of the list; with a given mesh, "
         "one in n, spread evenly.",
     )
     max_points: Annotated[int, Field(ge=4, le=10_000_000)] | None = Field(
-        None,
+        default=None,
         description="Use at most this many points, spread evenly, and decimate the mesh accordingly; null: all. A pixel grid "
         "is decimated by the smallest stride that suffices.",
     )
     min_seen: int = Field(
-        2,
+        default=2,
         ge=1,
         le=1000,
         description="A point visible in fewer frames than this is excluded from the solve. It keeps its index in the result and "
@@ -283,31 +289,31 @@ class Options(Chosen):
     )
 
     template_frame: Annotated[int, Field(ge=0, le=10_000_000)] | None = Field(
-        None,
+        default=None,
         description="For a film: the frame whose points are tracked in both directions, counted in the complete film from 0; null: the "
         "region's frame if it lies in the middle third of the film or the region is mostly lost there, otherwise the sharpest "
         "frame of that third.",
     )
     grid_step: Annotated[float, Field(ge=1, le=100, allow_inf_nan=False)] | None = Field(
-        None,
+        default=None,
         description="For a film: distance of neighbouring points in the film's pixels; null: 4 to 8 in the tracked frames, chosen for "
         "about 4,000 points.",
     )
     longest_side: int = Field(
-        960,
+        default=960,
         ge=64,
         le=4096,
         description="For a film: maximum size of the longer side of tracked frames, pixels; larger films are scaled down. Tracks remain in "
         "the film's own pixels.",
     )
     region_frame: int = Field(
-        0,
+        default=0,
         ge=0,
         le=10_000_000,
         description="For a film: the frame on which the region was drawn, counted in the complete film from 0.",
     )
     region_polygon: Annotated[tuple[tuple[Pixel, Pixel], ...], Field(min_length=3, max_length=1000)] | None = Field(
-        None,
+        default=None,
         description="For a film: corners [x, y] of the region to track, in the film's pixels, y down, instead of a mask picture; "
         "null: the mask, or the entire picture.",
     )

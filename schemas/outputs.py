@@ -15,13 +15,17 @@ class OutputRequest(Chosen):
         description="Files to write: glb, ply, obj, usd, abc, mdd, mat, csv; see the option `outputs` of a job."
     )
     fps: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] | None = Field(
-        None, description="Frames per second of the written animation; null: as in the job."
+        default=None, description="Frames per second of the written animation; null: as in the job."
     )
-    normals: Literal["static", "animated", "none"] | None = Field(None, description="As in the options of a job.")
-    colours: Literal["none", "error", "expected_error"] | None = Field(None, description="As in the options of a job.")
-    axes: Literal["tracks", "viewer"] | None = Field(None, description="As in the options of a job.")
-    glb_quantized: bool | None = Field(None, description="As in the options of a job.")
-    glb_motion: Literal["auto", "frames"] | None = Field(None, description="As in the options of a job.")
+    normals: Literal["static", "animated", "none"] | None = Field(
+        default=None, description="As in the options of a job."
+    )
+    colours: Literal["none", "error", "expected_error"] | None = Field(
+        default=None, description="As in the options of a job."
+    )
+    axes: Literal["tracks", "viewer"] | None = Field(default=None, description="As in the options of a job.")
+    glb_quantized: bool | None = Field(default=None, description="As in the options of a job.")
+    glb_motion: Literal["auto", "frames"] | None = Field(default=None, description="As in the options of a job.")
 
     def applied_to(self, options: Options) -> Options:
         """Return the options of a job with the outputs and the overridden options of this request."""

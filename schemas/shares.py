@@ -17,7 +17,7 @@ class ShareRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    expires_in: int = Field(7 * DAY, ge=60, le=366 * DAY, description="Seconds until the link expires.")
+    expires_in: int = Field(default=7 * DAY, ge=60, le=366 * DAY, description="Seconds until the link expires.")
 
 
 class Share(Record):
@@ -27,9 +27,9 @@ class Share(Record):
     created_at: datetime = Field(description="When the link was created.")
     expires_at: datetime = Field(description="When it stops working.")
     token: str | None = Field(
-        None,
+        default=None,
         description="Bearer token that reads the job and its files, and nothing else. Only the answer that creates the link has it.",
     )
     path: str | None = Field(
-        None, description="Address of the page that shows the result, relative to the service; holds the token."
+        default=None, description="Address of the page that shows the result, relative to the service; holds the token."
     )

@@ -122,7 +122,8 @@ def of_error(error: WorkerError | InvalidInput) -> ProblemResponse:
     if status is None:
         status = 422 if isinstance(error, Invalid) else 500
     after = getattr(error, "retry_after", None)
-    problem = Problem.of(error.code, status, detail=str(error), **members_of(error))
+    again = {"retryable": error.retryable} if isinstance(error, WorkerError) else {}
+    problem = Problem.of(error.code, status, detail=str(error), **again, **members_of(error))
     return ProblemResponse(problem, headers=None if after is None else {"Retry-After": str(after)})
 
 

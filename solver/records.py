@@ -390,6 +390,6 @@ def _confidence(visible: ArrayLike | None, shape: tuple[int, int], scratch: str 
     if not np.isfinite(confidence).all() or confidence.min() < 0 or confidence.max() > 1:
         raise wrong_input(
             "visibility", "out_of_range", "values from 0 to 1", f"values from {confidence.min():.3g} to {confidence.max():.3g}",
-            "Turn logits into probabilities first.",
+            "Convert a mask to bool, and logits to probabilities.",
         )  # fmt: skip
     return confidence

@@ -183,14 +183,19 @@ class TooManyQueued(WorkerError):
 
 
 class QuotaExceeded(WorkerError):
-    """The disk quota is reached."""
+    """A job or an upload does not fit into the disk quota beside the others, or is larger than the quota."""
 
     code = "quota_exceeded"
     retryable = True
 
-    def __init__(self, *, used: int, quota: int) -> None:
+    def __init__(self, *, used: int, quota: int, needed: int) -> None:
+        self.retryable = needed <= quota
         super().__init__(
-            f"Disk quota reached: {used:,} of {quota:,} bytes are used. Delete jobs, wait until they expire, or raise PLIANT_DISK_QUOTA."
+            f"Disk quota reached: {used:,} of {quota:,} bytes are used, and {needed:,} more are needed. "
+            "Delete jobs, wait until they expire, or raise PLIANT_DISK_QUOTA."
+            if self.retryable
+            else f"Disk quota too small: {needed:,} bytes are needed, and the quota is {quota:,}. "
+            "Send fewer frames or points, or raise PLIANT_DISK_QUOTA."
         )
 
 
@@ -238,11 +243,11 @@ class BadBackup(WorkerError):
 
 
 class ServerFailed(WorkerError):
-    """The embedded Valkey cannot be started."""
+    """The embedded Valkey or the API cannot be started."""
 
     code = "server_failed"
 
-    def __init__(self, sentence: str, *, log: str) -> None:
+    def __init__(self, sentence: str, *, log: str = "") -> None:
         super().__init__(f"{sentence} Its log ends with: {log}" if log else sentence)
 
 

@@ -336,6 +336,12 @@ def utc_now() -> datetime:
     return datetime.now(UTC)
 
 
+def dated(text: str) -> list[str]:
+    """Return the lines of an entry of a job's log, each with the current time."""
+    moment = utc_now().strftime("%Y-%m-%dT%H:%M:%SZ")
+    return [f"{moment} {line}" for line in text.splitlines()]
+
+
 def milliseconds(moment: datetime) -> int:
     """Return a time as whole milliseconds since 1970."""
     return int(moment.timestamp() * 1000)

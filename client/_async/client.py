@@ -21,8 +21,8 @@ from pliant.client._async.events import follow
 from pliant.client._async.job import AsyncRemoteJob, AsyncResult
 from pliant.client._async.operations import OnJob
 from pliant.client.call import Call
-from pliant.client.errors import NotFound
-from pliant.client.input_files import Region, Source, expanded
+from pliant.client.errors import BadArgument, NotFound
+from pliant.client.input_files import Region, Source, folder_to_fill
 from pliant.client.multipart import Inputs, OnBytes, option_fields
 from pliant.client.pauses import in_thread
 from pliant.client.requests import further, key_header, sharing, status_names
@@ -285,9 +285,11 @@ class AsyncClient(AsyncConnection):
         Raises
         ------
         BadArgument
-            There is no such status.
+            There is no such status, or the limit is negative.
         """
         exchange, wanted = self._exchange(timeout), status_names(statuses)
+        if limit is not None and limit < 0:
+            raise BadArgument(f"limit: expected at least 0 jobs, or None for all, got {limit}.")
         left = math.inf if limit is None else limit
         cursor: str | None = ""
         while cursor is not None and left > 0:
@@ -325,10 +327,12 @@ class AsyncClient(AsyncConnection):
 
         Raises
         ------
-        JobFailed, JobCancelled, WaitTimeout, Unreachable, APIStatusError
+        JobFailed, JobCancelled, WaitTimeout, Unreachable, APIStatusError, BadArgument
             See `pliant.client.errors`.
         """
         exchange = self._exchange(timeout, f"the wait for job {job}")
+        if folder is not None:
+            folder_to_fill(folder, "folder")  # now, and not after the job has run for minutes
         record = succeeded(await operations.wait(exchange, job, on_progress=on_progress))
         result = AsyncResult(self, record, folder)
         if load:
@@ -477,7 +481,7 @@ class AsyncClient(AsyncConnection):
         exchange = self._exchange(timeout, f"the download of job {job}")
         record = await exchange.record(Call(method="GET", path=job_path(job)), Job)
         return await operations.fetch(
-            exchange, record, expanded(folder, "folder"), names=names, on_download=on_download
+            exchange, record, folder_to_fill(folder, "folder"), names=names, on_download=on_download
         )
 
     async def options(self, *, timeout: float | None = None) -> dict[str, Any]:

@@ -22,8 +22,8 @@ from pliant.client._sync.events import follow
 from pliant.client._sync.job import RemoteJob, Result
 from pliant.client._sync.operations import OnJob
 from pliant.client.call import Call
-from pliant.client.errors import NotFound
-from pliant.client.input_files import Region, Source, expanded
+from pliant.client.errors import BadArgument, NotFound
+from pliant.client.input_files import Region, Source, folder_to_fill
 from pliant.client.multipart import Inputs, OnBytes, option_fields
 from pliant.client.pauses import in_place
 from pliant.client.requests import further, key_header, sharing, status_names
@@ -286,9 +286,11 @@ class Client(Connection):
         Raises
         ------
         BadArgument
-            There is no such status.
+            There is no such status, or the limit is negative.
         """
         exchange, wanted = self._exchange(timeout), status_names(statuses)
+        if limit is not None and limit < 0:
+            raise BadArgument(f"limit: expected at least 0 jobs, or None for all, got {limit}.")
         left = math.inf if limit is None else limit
         cursor: str | None = ""
         while cursor is not None and left > 0:
@@ -326,10 +328,12 @@ class Client(Connection):
 
         Raises
         ------
-        JobFailed, JobCancelled, WaitTimeout, Unreachable, APIStatusError
+        JobFailed, JobCancelled, WaitTimeout, Unreachable, APIStatusError, BadArgument
             See `pliant.client.errors`.
         """
         exchange = self._exchange(timeout, f"the wait for job {job}")
+        if folder is not None:
+            folder_to_fill(folder, "folder")  # now, and not after the job has run for minutes
         record = succeeded(operations.wait(exchange, job, on_progress=on_progress))
         result = Result(self, record, folder)
         if load:
@@ -475,7 +479,9 @@ class Client(Connection):
         """
         exchange = self._exchange(timeout, f"the download of job {job}")
         record = exchange.record(Call(method="GET", path=job_path(job)), Job)
-        return operations.fetch(exchange, record, expanded(folder, "folder"), names=names, on_download=on_download)
+        return operations.fetch(
+            exchange, record, folder_to_fill(folder, "folder"), names=names, on_download=on_download
+        )
 
     def options(self, *, timeout: float | None = None) -> dict[str, Any]:
         """Return the JSON Schema of the options: names, meanings, bounds, defaults."""

@@ -17,6 +17,10 @@ from pliant.client.retry import Attempts, Contact, Retry
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 
+UNLIMITED = httpx.Limits(max_connections=None, max_keepalive_connections=20)
+"""As many connections as the program has calls under way: a wait or an event stream holds one, and beyond httpx's 100 others would
+starve. Idle connections are kept as by default."""
+
 
 class Connection:
     """Base class of `Client`, which documents the parameters. Close it, or use it in a ``with`` block."""
@@ -35,12 +39,15 @@ class Connection:
         event_hooks: Mapping[str, list[Callable[..., Any]]] | None = None,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
+        if not isinstance(retries, Retry):
+            raise BadArgument(f"retries: expected a Retry, such as Retry(patience=10), got {retries!r}.")
         self.url = base_of(url if url is not None else os.environ.get("PLIANT_URL") or DEFAULT_URL)
         bearer = token if token is not None else os.environ.get("PLIANT_TOKEN") or None
         self._http = httpx.Client(
             base_url=self.url,
             headers=headers_of(bearer, headers),
             verify=verify,
+            limits=UNLIMITED,
             event_hooks=event_hooks,
             transport=transport,
         )

@@ -108,7 +108,7 @@ class Authentication:
             await found(scope, receive, send)
             return
         owner = None if found.sees_all else found.owner
-        scope["pliant.token"], scope["pliant.owner"] = found, owner
+        scope["pliant.owner"] = owner
         scope["pliant.still_valid"] = StillValid(self._tokens, found, every=self._recheck)
         await self._app(scope, receive, send)
 
@@ -122,6 +122,9 @@ class Authentication:
         if token is None:
             detail = "The token is not known; it may have been revoked. Ask the operator for a new one."
             return _unauthorized(ProblemCode.INVALID_TOKEN, detail)
+        scope["pliant.token"] = (
+            token  # from here on it is known whose request this is: the access log names a refused one, too
+        )
         if token.expired(utc_now()):
             detail = "The token has expired. Ask the operator for a new one."
             return _unauthorized(ProblemCode.EXPIRED_TOKEN, detail)

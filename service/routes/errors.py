@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from html import escape
 from typing import Annotated
 
@@ -75,6 +76,11 @@ def page_of(error: ErrorCode) -> str:
         f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
         f"<title>{escape(error.code)}: {escape(error.title)}</title>"
         f"<h1>{escape(error.title)}</h1><p><code>{escape(error.code)}</code></p>{status}"
-        f"<h2>Cause</h2><p>{escape(error.cause)}</p><h2>Remedy</h2><p>{escape(error.remedy)}</p>"
+        f"<h2>Cause</h2><p>{_with_code(error.cause)}</p><h2>Remedy</h2><p>{_with_code(error.remedy)}</p>"
         '<p><a href="../guide">Guide: what can be sent, and what comes back</a></p></html>\n'
     )
+
+
+def _with_code(text: str) -> str:
+    """Return a sentence as HTML; what stands between backticks is code."""
+    return re.sub(r"`([^`]*)`", r"<code>\1</code>", escape(text))

@@ -354,7 +354,7 @@ def _warnings(doubt: str | None, focal: float | None, least: Tried, chosen: Trie
     if doubt is not None:
         warnings.append(
             f"The surface was required to be isometric, but the tracks hardly support it: {doubt}. Solve with surface=free, too, and "
-            "look at both from the side: this one suits paper and cloth, the free one what stretches or tears."
+            "look at both from the side: this one suits paper and cloth, and the free one suits what stretches or tears."
         )
     if focal is not None and chosen.found.inconsistency > CLEAR * least.found.inconsistency:
         warnings.append(

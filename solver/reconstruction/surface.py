@@ -122,5 +122,5 @@ def _unlike(free: Floats, isometric: Floats) -> float:
 def _weak_evidence_warning(unlike: float) -> str:
     return (
         f"The evidence for constant lengths is weak, and a free surface differs by {unlike:.0%} of the size. Solve with surface=free, too, "
-        "and look at both from the side: this one suits paper and cloth, the free one what stretches or tears."
+        "and look at both from the side: this one suits paper and cloth, and the free one suits what stretches or tears."
     )

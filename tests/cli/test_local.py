@@ -26,6 +26,7 @@ from pliant.client import BadArgument, Unreachable
 from pliant.schemas.job import LONGEST_NAME
 from pliant.service.settings import ServiceSettings
 from pliant.service.testing import InMemoryService
+from pliant.worker.errors import ServerFailed
 from pliant.worker.processes.valkey import find_binary
 from pliant.worker.settings import NUMERICAL_THREADS, Settings
 from serving import free_port, until
@@ -115,7 +116,7 @@ def test_the_service_logs_warnings_unless_a_level_is_configured(
 def test_a_service_that_exits_during_startup_is_reported() -> None:
     process = subprocess.Popen([sys.executable, "-c", "raise SystemExit(7)"])
     process.wait()
-    with pytest.raises(Unreachable, match="ended with code 7"):
+    with pytest.raises(ServerFailed, match="ended with code 7; the lines above state why"):
         up.until_ready("http://127.0.0.1:9")(process)
 
 

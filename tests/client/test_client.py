@@ -7,6 +7,7 @@ import copy
 import pickle
 import ssl
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -86,12 +87,13 @@ def test_the_asynchronous_client_takes_asynchronous_hooks() -> None:
 
 
 def test_verify_reaches_httpx(monkeypatch: pytest.MonkeyPatch) -> None:
-    given: list[object] = []
-    monkeypatch.setattr(httpx, "Client", lambda **settings: given.append(settings["verify"]))
+    given: list[dict[str, Any]] = []
+    monkeypatch.setattr(httpx, "Client", lambda **settings: given.append(settings))
     context = ssl.create_default_context()
     for verify in (True, False, context):
         Client(verify=verify)
-    assert given == [True, False, context]
+    assert [settings["verify"] for settings in given] == [True, False, context]
+    assert {settings["limits"].max_connections for settings in given} == {None}, "many waits need many connections"
 
 
 POINTS = np.random.default_rng(0).normal(size=(6, 16, 2)) * 100

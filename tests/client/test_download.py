@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
-from pliant.client import AsyncClient, Client, CorruptDownload, Retry, Unreachable, WaitTimeout
+from pliant.client import AsyncClient, BadArgument, Client, CorruptDownload, Retry, Unreachable, WaitTimeout
 from pliant.client.locks import lock
 from pliant.service.testing import InMemoryService
 
@@ -170,6 +171,21 @@ def test_folders_and_files_can_be_in_the_home_directory(tmp_path: Path, monkeypa
         result.save_glb("~/third.glb")
     found = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*")}
     assert {"first/shapes.npz", "second/report.json", "third.glb"} <= found
+
+
+def test_a_file_in_place_of_a_folder_is_refused_before_the_job_is_waited_for(tmp_path: Path) -> None:
+    (tmp_path / "tracks.npz").write_bytes(b"mine")
+    with Client("http://pliant.test", transport=InMemoryService(steps=math.inf), retries=QUICK) as client:
+        job = client.submit(POINTS)
+        for folder in (tmp_path / "tracks.npz", tmp_path / "tracks.npz" / "below"):
+            with pytest.raises(
+                BadArgument, match=r"^folder: expected a folder, got the file .*tracks\.npz\. Choose another folder\.$"
+            ):
+                job.wait(folder=folder, timeout=30)
+        with pytest.raises(BadArgument, match="folder: expected a folder, got the file"):
+            client.download(job.id, tmp_path / "tracks.npz")
+        job.cancel()
+    assert (tmp_path / "tracks.npz").read_bytes() == b"mine"
 
 
 def test_the_animation_can_be_saved_where_it_was_downloaded(tmp_path: Path) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
+from pathlib import Path
 
 import numpy as np
+import pliant.schemas
 import pytest
 from pliant.schemas.options import SOLVER_FIELDS, Options
 from pliant.schemas.outputs import OutputRequest
@@ -22,6 +25,20 @@ def test_options_mirror_the_solver_settings_and_their_defaults() -> None:
 
 def test_every_option_has_a_description() -> None:
     assert all(field.description for field in Options.model_fields.values())
+
+
+def test_type_checkers_see_which_fields_have_a_default() -> None:
+    """Without a plugin they recognise `default=` only by its keyword (PEP 681), and else ask users for every field of a record."""
+    (folder,) = pliant.schemas.__path__
+    calls = [
+        node
+        for path in Path(folder).glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call)
+    ]
+    fields = [call for call in calls if isinstance(call.func, ast.Name) and call.func.id == "Field"]
+    assert len(fields) > 50
+    assert not [ast.unparse(call) for call in fields if call.args]
 
 
 @pytest.mark.parametrize("given", ["usd, glb,usd", ["usd", "glb"], ("glb", "usd")])

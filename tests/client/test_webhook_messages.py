@@ -78,6 +78,22 @@ def test_a_signed_message_without_a_job_is_an_error(body: bytes) -> None:
         verified(signed(SECRET, id="m", timestamp=NOW, body=body), body, secret=SECRET, now=NOW)
 
 
+def test_what_is_neither_a_body_nor_a_secret_is_named(job: Job) -> None:
+    body = message(job)
+    headers = signed(SECRET, id="msg_one", timestamp=NOW, body=body)
+    with pytest.raises(
+        BadArgument, match=r"^body: expected the bytes of the request, got a value of type str\. Pass the body as it"
+    ):
+        verified(headers, body.decode(), secret=SECRET, now=NOW)  # type: ignore[arg-type]
+    with pytest.raises(
+        BadArgument, match=r"^secret: expected the value passed as webhook_secret, got a value of type NoneType\."
+    ):
+        verified(headers, body, secret=None, now=NOW)  # type: ignore[arg-type]
+    with pytest.raises(InvalidSignature, match="signed 3600 s in the future, by this machine's clock, more than 300 s"):
+        verified(headers, body, secret=SECRET, now=NOW - 3600)
+    assert verified(headers, bytearray(body), secret=SECRET, now=NOW) == job  # type: ignore[arg-type]
+
+
 def test_secrets_are_random_and_accepted_by_the_service() -> None:
     assert new_secret() != new_secret()
     assert parse_webhook("https://receiver.example/", new_secret()) is not None

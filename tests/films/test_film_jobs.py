@@ -29,13 +29,14 @@ from pliant.solver.errors import InvalidInput
 from pliant.tracking import open_film
 from pliant.tracking.advice import warnings_before
 from pliant.tracking.contact_sheet import small_jpeg
+from pliant.tracking.records import Followed, TrackingStep
 from pliant.tracking.survey import Survey
 from pliant.worker.errors import Interrupted, InvalidRequest, TimedOut
 from pliant.worker.execution.film import reconstruct_film, solving_seconds
 from pliant.worker.execution.pace import MachinePace
 from pliant.worker.films import frame_strip, tracker
 from pliant.worker.films.bounds import FilmBounds
-from pliant.worker.films.contained_process import SHARES
+from pliant.worker.films.contained_process import SHARES, _followed
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.sources import FilmSource, is_source, looks_like_film, open_source, save_source
 from pliant.worker.films.tracker import (
@@ -387,6 +388,18 @@ def check_followed(steps: list[Progress], folder: Path) -> None:
         assert followed.seconds == pytest.approx(file["frame_times"][row])
         apart = np.linalg.norm(places[:, None] - file["tracks"][row][None], axis=2).min(axis=1)
     assert np.median(apart) <= 0.71  # rounding to whole pixels
+
+
+def test_the_points_shown_during_tracking_are_spread_over_the_object() -> None:
+    across, down = np.meshgrid(np.arange(48), np.arange(36))
+    places = np.stack([across, down], axis=2).reshape(-1, 2).astype(float)
+    step = TrackingStep("track", 1, 9, Followed(1, 0.04, places, np.ones(len(places), bool)))
+    shown = _followed(step, (48, 36))
+    assert shown is not None
+    columns, rows = np.array(shown["points"]).reshape(-1, 2).T
+    assert len(columns) == 150
+    assert len(set(columns.tolist())) > 40, "every twelfth point would be four of the 48 columns"
+    assert len(set(rows.tolist())) > 30
 
 
 def check_film_frames(folder: Path, *, count: int) -> None:

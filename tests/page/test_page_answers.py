@@ -60,6 +60,7 @@ def test_the_token_form_appears_after_other_errors_and_keeps_a_half_typed_token(
         "fine": {"json": waiting},
         "unreadable": {"status": 200, **HTML},
         "locked": problem(401, "unauthorized"),
+        "rejected": problem(401, "invalid_token", field="Authorization"),
         "busy": problem(503, "queue_unavailable", retryable=True),
     }
     now = "fine"
@@ -81,8 +82,11 @@ def test_the_token_form_appears_after_other_errors_and_keeps_a_half_typed_token(
     before = len(sent)
     heard(page, lambda: len(sent) > before + 1)
     expect(alert).to_have_attribute("data-seen", "yes")  # announced once
+    now = "rejected"
+    expect(alert).to_contain_text("invalid_token")
+    expect(alert).not_to_contain_text("Authorization")
     now = "busy"
-    expect(alert).to_contain_text("It is so.")
+    expect(alert).to_contain_text("queue_unavailable")
     expect(token).to_have_value("half")
     expect(token).to_be_focused()
     now = "locked"

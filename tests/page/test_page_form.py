@@ -131,6 +131,10 @@ def test_a_film_chosen_as_tracks_moves_to_the_film_input(page: Page) -> None:
     expect(page.locator("[data-part=film]")).to_contain_text("clip.mp4")
     expect(page.locator("[data-part=tracks]")).to_be_hidden()
     expect(page.locator("[data-part=film]").get_by_role("alert")).to_be_visible(timeout=SOON)
+    expect(page.get_by_text("Not read: see “Film” above.")).to_be_visible()  # nothing was submitted
+    expect(page.get_by_role("button", name="Choose a mask picture")).to_be_hidden()  # nor will its first frame come
+    page.get_by_role("button", name="Remove film").click()
+    expect(page.get_by_text("Not read")).to_be_hidden()
 
 
 @pytest.mark.usefixtures("front")
@@ -161,7 +165,8 @@ def test_a_finished_job_can_be_exported_shared_and_rerun(page: Page, url: str, f
     page.get_by_role("button", name="Create a link").click()
     link = page.get_by_label("Link to this result").input_value()
     assert link.startswith(f"{url}/#share=share.{finished}.")
-    guest = page.context.new_page()
+    guest, refused = page.context.new_page(), list[str]()
+    guest.on("response", lambda response: refused.append(response.url) if response.status >= 400 else None)
     guest.goto(link)
     expect(guest.get_by_text("This is a shared, read-only result.")).to_be_visible()
     expect(guest.get_by_role("heading", name="a finished face")).to_be_visible()
@@ -169,6 +174,7 @@ def test_a_finished_job_can_be_exported_shared_and_rerun(page: Page, url: str, f
     expect(guest.get_by_role("button", name="Reconstruct")).to_be_hidden()
     expect(guest.locator(".view canvas").first).to_be_visible(timeout=SOON)
     assert axe_findings(guest) == []
+    assert refused == [], "the page asks for nothing that the link does not allow"
     newest = httpx.get(f"{url}/v1/jobs/{finished}/shares").json()[-1]["id"]  # other links may exist
     of_the_link = page.get_by_role("listitem").filter(has_text=f"Link {newest},")
     of_the_link.get_by_role("button", name="Revoke").click()

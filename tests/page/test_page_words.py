@@ -107,3 +107,10 @@ def test_error_difference_is_grey_where_a_point_is_hidden_in_one_job() -> None:
             [16383] * 3,
         ],
     ]
+
+
+def test_a_sample_of_a_grid_is_spread_over_its_columns() -> None:
+    chosen = evaluate("viewer/scattered", "module.scattered(36 * 48, 500)")
+    assert chosen == sorted(set(chosen))
+    assert (len(chosen), len({point % 48 for point in chosen})) == (500, 48)
+    assert evaluate("viewer/scattered", "module.scattered(3, 500)") == [0, 1, 2]

@@ -156,7 +156,8 @@ def test_the_type_of_a_problem_resolves_to_its_explanation(http: httpx.Client) -
     }
     page = http.get(answer["type"], headers={"Accept": "text/html,*/*"})
     assert page.headers["content-type"] == "text/html; charset=utf-8"
-    assert f"<p>{ProblemCode.UNKNOWN_JOB.remedy}</p>" in page.text
+    assert "`" not in page.text
+    assert "<p>List your jobs; check <code>expires_at</code>.</p>" in page.text
     assert '<a href="../guide">' in page.text
     assert "<script" not in page.text
     assert "style" not in page.text

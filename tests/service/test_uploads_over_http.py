@@ -241,10 +241,14 @@ def test_uploads_count_toward_the_quota(serve: Serve) -> None:
         answer = http.put("/v1/uploads/second", content=b"x" * 100_000)
         assert (answer.status_code, answer.json()["code"], answer.json()["retryable"]) == (507, "quota_exceeded", True)
         assert re.fullmatch(
-            r"Disk quota reached: 1\d\d,\d{3} of 150,000 bytes are used\. "
+            r"Disk quota reached: 1\d\d,\d{3} of 150,000 bytes are used, and 100,000 more are needed\. "
             r"Delete jobs, wait until they expire, or raise PLIANT_DISK_QUOTA\.",
             answer.json()["detail"],
         ), answer.json()["detail"]
+        never = http.put("/v1/uploads/third", content=b"x" * 200_000).json()
+        assert (never["code"], never["retryable"]) == ("quota_exceeded", False), (
+            "the client does not wait for what never fits"
+        )
         http.delete("/v1/uploads/first")
         assert http.put("/v1/uploads/second", content=b"x" * 100_000).status_code == 201
         assert http.put("/v1/uploads/second", content=b"x" * 100_000).status_code == 409

@@ -31,7 +31,7 @@ from pliant.worker.execution.progress import Reporter
 from pliant.worker.execution.workdir import OUTPUT, working_directory
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
-from pliant.worker.records import Stored
+from pliant.worker.records import Stored, dated
 from pliant.worker.settings import Settings
 
 if TYPE_CHECKING:
@@ -152,9 +152,8 @@ class Attempt:
 
     def log(self, text: str) -> None:
         """Append text to the job's log; it is written with the next progress."""
-        moment = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         with self._log_lock:
-            self._lines += [f"{moment} {line}" for line in text.splitlines()]
+            self._lines += dated(text)
 
     def failed(self, error: Exception) -> Problem:
         """Return the problem that an error ends the job with, and log it, with a traceback if it is unexpected."""

@@ -10,6 +10,9 @@ from pliant.schemas.invalid import Invalid, members_of
 from pliant.schemas.job import Problem
 from pliant.worker.errors import StoreUnavailable, TimedOut
 
+UNRECORDED = os.EX_TEMPFAIL
+"""Exit code of a job process that the store of records did not let record its outcome."""
+
 _NO_THREADS = ("can't start new thread", os.strerror(errno.EAGAIN))
 """Messages of Python and SciPy when a thread's stack does not fit into the address space."""
 
@@ -67,7 +70,14 @@ def how_it_ended(status: int) -> str:
     """Return a sentence for a wait status."""
     if os.WIFSIGNALED(status):
         return f"The job process was ended by signal {_named(os.WTERMSIG(status))}."
+    if was_unrecorded(status):
+        return "The job store did not answer when the job ended."
     return f"The job process ended with code {os.WEXITSTATUS(status)} without recording an outcome."
+
+
+def was_unrecorded(status: int) -> bool:
+    """Return True if by its wait status a job process ended because the store did not take its outcome."""
+    return os.WIFEXITED(status) and os.WEXITSTATUS(status) == UNRECORDED
 
 
 def _named(number: int) -> str:

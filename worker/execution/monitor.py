@@ -14,12 +14,19 @@ from typing import TypeVar
 
 from pliant.schemas.job import Problem, Status
 from pliant.worker.errors import StaleAttempt, StoreUnavailable, TimedOut, UnknownJob
-from pliant.worker.execution.failures import how_it_ended, out_of_memory, problem_of, timed_out, worker_lost
+from pliant.worker.execution.failures import (
+    how_it_ended,
+    out_of_memory,
+    problem_of,
+    timed_out,
+    was_unrecorded,
+    worker_lost,
+)
 from pliant.worker.execution.workdir import output_tail
 from pliant.worker.ids import new_attempt_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.processes.containment import OomKills
-from pliant.worker.records import Records, Stored
+from pliant.worker.records import Records, Stored, dated
 from pliant.worker.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -143,7 +150,7 @@ def finalize(watch: Watch, *, status: int, peak: int, deadline: RetryDeadline) -
     """
     change = _verdict(watch, status=status, peak=peak)
     sentence = f"Ended by the worker: {watch.reason}." if watch.reason is not None else how_it_ended(status)
-    words = [sentence, *output_tail(watch.settings, watch.attempt_id)]
+    words = [*dated(sentence), *output_tail(watch.settings, watch.attempt_id)]
 
     def record_verdict() -> Stored:
         change(watch.records.get(watch.id))  # raises if the outcome is recorded already
@@ -167,16 +174,16 @@ def _verdict(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stor
             raise StaleAttempt(watch.id)
         if watch.reason is Reason.CANCELLED:
             return lifecycle.stop(stored, attempt_id=attempt_id, now=now, retention=settings.retention)
-        if watch.reason is Reason.STOPPING or (watch.reason is None and watch.stopping and _was_killed(status)):
-            problem = worker_lost("The worker was shut down.")
-            fresh = new_attempt_id(watch.id)
+        stopped = watch.reason is Reason.STOPPING or (watch.reason is None and watch.stopping and _was_killed(status))
+        # An outage of the store is no fault of the job: it is repeated, as it is by the reconciler when the outage lasts longer.
+        if stopped or (watch.reason is None and was_unrecorded(status)):
             return lifecycle.requeue(
                 stored,
                 attempt_id=attempt_id,
-                fresh=fresh,
-                problem=problem,
+                fresh=new_attempt_id(watch.id),
+                problem=worker_lost("The worker was shut down." if stopped else how_it_ended(status)),
                 now=now,
-                max_attempts=None,
+                max_attempts=None if stopped else settings.max_attempts,
                 retention=settings.retention,
             )
         if watch.reason is Reason.TIMED_OUT:

@@ -21,6 +21,7 @@ import redis
 from pliant.schemas.job import Status
 from pliant.worker.errors import StoreUnavailable, UnknownJob
 from pliant.worker.execution import attempt as work
+from pliant.worker.execution.failures import UNRECORDED
 from pliant.worker.execution.monitor import RetryDeadline, Watch, finalize
 from pliant.worker.execution.workdir import clean_up
 from pliant.worker.jobs.lifecycle import ACTIVE
@@ -71,7 +72,13 @@ class Delivery(RqJob):
             raise PermissionError(
                 f"rejected a delivery of {named!r} with {len(arguments)} arguments, which is not an attempt"
             )
-        work.run(arguments[0], arguments[1], settings=self.settings, worker=str(self.worker_name))
+        try:
+            work.run(arguments[0], arguments[1], settings=self.settings, worker=str(self.worker_name))
+        except StoreUnavailable as error:
+            logger.warning("job %s: the outcome is not recorded: %s", arguments[0], error)
+            os._exit(
+                UNRECORDED
+            )  # RQ would end with the code of any error, and the worker could not tell an outage from a crash
 
     @property
     def success_callback(self) -> None:

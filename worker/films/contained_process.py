@@ -15,6 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from pliant.solver.errors import InvalidInput
 from pliant.worker.films import frame_strip
 from pliant.worker.films.bounds import FilmBounds
@@ -214,8 +215,9 @@ def _followed(step: TrackingStep, size: tuple[int, int]) -> dict[str, Any] | Non
     """Return up to `FOLLOWED_POINTS` visible points of the frame just tracked, in the schema `FollowedPoints`."""
     if step.followed is None:
         return None
-    points = step.followed.points[step.followed.visible]
-    some = points[:: max(1, -(-len(points) // FOLLOWED_POINTS))]
+    # In a random order, the same in every frame: every n-th point of a grid would be whole columns of it.
+    order = np.random.default_rng(0).permutation(len(step.followed.points))
+    some = step.followed.points[order[step.followed.visible[order]][:FOLLOWED_POINTS]]
     return {
         "frame": step.followed.index, "seconds": step.followed.time, "width": size[0], "height": size[1],
         "points": some.round().astype(int).ravel().tolist(),

@@ -46,7 +46,7 @@ def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
     checked = Tracks.from_arrays(points, confidence)
     hidden = float((checked.visible == 0).mean())
     notes = [
-        f"{given} points of the film were tracked; {hidden:.1%} of the observations are hidden and carry no weight."
+        f"{given:,} points of the film were tracked; {hidden:.1%} of the observations are hidden and carry no weight."
     ]
     stated = Interpretation(
         num_frames=checked.num_frames, num_points=checked.num_points, num_faces=0 if mesh is None else len(mesh.faces),

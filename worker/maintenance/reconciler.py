@@ -27,7 +27,7 @@ from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import RANKS, order_waiting
 from pliant.worker.jobs.validation import LARGEST_PAGE
 from pliant.worker.maintenance.retention import Retention, is_wanted
-from pliant.worker.records import Beat
+from pliant.worker.records import Beat, dated
 from pliant.worker.store.outage import Outage, warn
 
 logger = logging.getLogger(__name__)
@@ -216,4 +216,4 @@ class Reconciler:
 
     def _log(self, id: str, sentence: str) -> None:
         logger.warning("job %s: %s", id, sentence)
-        self.jobs.records.append_log(id, [sentence])
+        self.jobs.records.append_log(id, dated(sentence))

@@ -48,6 +48,9 @@ class Child:
     log_tail: Callable[[], str] | None = None
     """Returns the last lines of its log, for the message that it ended."""
 
+    cause: Callable[[], str] | None = None
+    """Returns a sentence on why it may have ended, for the same message; empty if there is nothing to tell."""
+
     foundation: bool = False
     """Stop this process only after all others, which depend on it."""
 
@@ -123,8 +126,9 @@ class Supervisor:
                 each.process, each.restart_at = None, now + each.pause
                 last = "" if each.child.log_tail is None else each.child.log_tail()
                 why = f". Its log ends with: {last}" if last else ""
-                name, again = each.child.name, f"Starting it again in {each.pause:.1f} s"
-                logger.warning("%s ended with code %s%s. %s", name, code, why, again)
+                cause = "" if each.child.cause is None else each.child.cause()
+                told = f"{each.child.name} ended with code {code}{why}. {cause}".rstrip()
+                logger.warning("%s Starting it again in %.1f s", told, each.pause)
 
     def stop(self) -> None:
         """Stop the children, foundations last; kill each one that outlives its grace period."""
@@ -194,6 +198,7 @@ def valkey_child(valkey: Valkey) -> Child:
         descriptors=(valkey.server_lock,),
         ready=valkey.wait,
         log_tail=valkey.log_tail,
+        cause=valkey.cause,
         foundation=True,
         grace=15.0,
     )

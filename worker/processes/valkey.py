@@ -8,6 +8,7 @@ one socket would both run, and the writes of one would be lost).
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import importlib.util
 import os
@@ -16,6 +17,7 @@ import shutil
 import socket
 import stat
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -148,6 +150,10 @@ class Valkey:
             return ""
         return " / ".join(log.read_text(errors="replace").splitlines()[-4:])
 
+    def cause(self) -> str:
+        """Return why the server may have ended, in a sentence, if its log cannot tell; else an empty text."""
+        return f"The disk of {self.data} is full: free some space." if disk_is_full(valkey_directory(self.data)) else ""
+
     def release(self) -> None:
         """Remove the socket's directory if it is outside the data directory, and unlock; the server must have ended."""
         directory = socket_path(self.data).parent
@@ -156,6 +162,16 @@ class Valkey:
                 directory.rmdir()
         os.close(self.server_lock)
         os.close(self.supervisor_lock)
+
+
+def disk_is_full(directory: Path) -> bool:
+    """Return True if nothing can be written to a directory's disk for lack of space, or of the user's share of it."""
+    try:
+        with tempfile.TemporaryFile(dir=directory) as probe:
+            probe.write(bytes(os.statvfs(directory).f_bsize))
+    except OSError as fault:
+        return fault.errno in (errno.ENOSPC, errno.EDQUOT)
+    return False
 
 
 @contextmanager

@@ -170,7 +170,7 @@ class RedisRecords(Records):
         if taken == _FULL:
             raise TooManyQueued(max_queued)
         if taken == _NO_SPACE:
-            raise QuotaExceeded(used=self.used(), quota=max_bytes)
+            raise QuotaExceeded(used=self.used(), quota=max_bytes, needed=stored.bytes)
         if taken is None:
             return stored
         try:

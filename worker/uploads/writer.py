@@ -179,7 +179,9 @@ class Writer:
         capacity = self.capacity
         free = capacity.quota - capacity.used - others
         if size > free:
-            raise QuotaExceeded(used=capacity.used + others + self.offset, quota=capacity.quota)
+            raise QuotaExceeded(
+                used=capacity.used + others + self.offset, quota=capacity.quota, needed=size - self.offset
+            )
         return size if self.length is not None else min(size + RESERVED_AT_A_TIME, free)
 
 

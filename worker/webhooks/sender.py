@@ -20,7 +20,7 @@ from functools import partial
 from urllib.parse import urlsplit
 
 from pliant.worker.errors import StoreUnavailable, UnknownJob
-from pliant.worker.records import Records, Webhook
+from pliant.worker.records import Records, Webhook, dated
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 from pliant.worker.store.outage import Outage, warn
@@ -241,7 +241,7 @@ class WebhookSender:
 
     def _log(self, id: str, sentence: str) -> None:
         logger.info("job %s: %s", id, sentence)
-        self.records.append_log(id, [sentence])
+        self.records.append_log(id, dated(sentence))
 
 
 def trusted_by_default() -> ssl.SSLContext:

@@ -19,7 +19,7 @@ export class Compose {
   });
   private readonly inspection = new Inspection(
     () => this.form(),
-    (refusal) => (refusal ? this.refuse(refusal, () => undefined) : this.clear()),
+    (refusal) => (refusal ? this.refuse(refusal, "Not read", () => undefined) : this.clear()),
     (seen) => void this.slots.seen(seen),
   );
   private readonly label = h("input", { type: "text", id: "job-name", maxlength: 200, autocomplete: "off" });
@@ -254,8 +254,8 @@ export class Compose {
     this.stop.hidden = !busy;
   }
 
-  /** Show an error; `again` is called when the user has chosen one of several interpretations. */
-  private refuse(error: unknown, again = (): void => this.send.form?.requestSubmit()): void {
+  /** Show an error; `outcome` is what has become of the files, and `again` is called when the user has chosen one of several interpretations. */
+  private refuse(error: unknown, outcome = "Not submitted", again = (): void => this.send.form?.requestSubmit()): void {
     if (error instanceof Refusal) {
       const choose = (choice: Record<string, unknown>): void => {
         for (const [name, value] of Object.entries(choice)) this.options.set(name, value);
@@ -265,7 +265,7 @@ export class Compose {
       const [part = "", option = ""] = (error.problem.field ?? "").split(".");
       const placed = refusalBox(error.problem, choose, true);
       const shown = part === "options" ? this.options.refuse(option, placed) : !this.kept && this.slots.refuse(part, placed);
-      this.answer.replaceChildren(shown ? h("p", { class: "sentence bad" }, `Not submitted: see “${placeOf(part, option)}” above.`) : refusalBox(error.problem, choose));
+      this.answer.replaceChildren(shown ? h("p", { class: "sentence bad" }, `${outcome}: see “${placeOf(part, option)}” above.`) : refusalBox(error.problem, choose));
     } else throw error;
   }
 }

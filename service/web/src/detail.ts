@@ -176,7 +176,7 @@ export class Detail {
     this.metrics.show(job);
     this.sheet.show(job);
     this.files.show(job);
-    this.snippets.show(job);
+    if (!isShared()) this.snippets.show(job); // it is hidden there, and the link may not read the options
     this.afterwards.show(job);
     this.events.onJob(job);
     if (job.status === "succeeded" && !this.finished) {

@@ -99,6 +99,16 @@ export class Filming {
     if (this.undecoded) this.settle(null);
   }
 
+  /** The service refuses the film: if the browser cannot show it either, advice on its region would contradict the error. */
+  refused(): void {
+    this.element.hidden = this.picture === null;
+  }
+
+  /** The film is not refused, or not any more. */
+  accepted(): void {
+    this.element.hidden = this.film === null;
+  }
+
   /** Take the number of frames according to the service. */
   count(film: File, frames: number): void {
     if (this.film === film) this.frames = frames;
@@ -127,7 +137,10 @@ export class Filming {
   private settle(decoded: ImageBitmap | null): void {
     this.undecoded = decoded === null;
     this.picture = decoded ?? this.served;
-    if (decoded) this.served?.close();
+    if (decoded) {
+      this.served?.close();
+      this.accepted(); // whether the service refuses it or not: this is the film that its error is about
+    }
     this.served = null;
     this.update();
   }

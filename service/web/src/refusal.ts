@@ -29,7 +29,8 @@ const FIELD = "Change the value, or clear the field to use the default.";
  * that the box is next to the field concerned, so the field is not named again.
  */
 export function refusalBox(given: Problem, choose?: ((choice: Record<string, unknown>) => void) | null, inPlace = false): HTMLElement {
-  const problem = given.code === "unauthorized" ? { ...given, detail: GATE, field: null } : given;
+  const header = given.field === "Authorization"; // an HTTP header means nothing to a visitor, who has a token or a link
+  const problem = given.code === "unauthorized" ? { ...given, detail: GATE, field: null } : header ? { ...given, field: null } : given;
   const whole = inPlace ? unnamed(problem) : problem.detail;
   const hintInside = Boolean(problem.hint && whole.endsWith(problem.hint));
   const detail = hintInside ? whole.slice(0, -(problem.hint as string).length).trim() : whole;

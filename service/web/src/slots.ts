@@ -87,6 +87,7 @@ export class Slots {
     const slot = this.slots.get((part === "region" ? "film" : part) as Part);
     if (slot === undefined || slot.row.hidden) return false;
     slot.answer.replaceChildren(box);
+    if (part === "film") this.filming.refused();
     slot.row.scrollIntoView({ block: "nearest" });
     return true;
   }
@@ -94,6 +95,7 @@ export class Slots {
   /** Remove all error messages. */
   clear(): void {
     for (const { answer } of this.slots.values()) answer.replaceChildren();
+    this.filming.accepted();
   }
 
   focus(part: Part): void {

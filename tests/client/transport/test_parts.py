@@ -77,7 +77,9 @@ def test_the_same_arrays_make_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_meshes_can_be_grid_sizes_faces_or_files(tmp_path: Path) -> None:
-    assert {mesh_part(each, tmp_path) for each in ((3, 4), "3x4", "3 x 4", "3X4", "3×4")} == {"3x4"}
+    assert {mesh_part(each, tmp_path) for each in ((3, 4), [3, 4], np.array([3, 4]), "3x4", "3 x 4", "3X4", "3×4")} == {
+        "3x4"
+    }
     assert mesh_part("none", tmp_path) == "none"
     faces = mesh_part([[0, 1, 2], [0, 2, 3]], tmp_path)
     assert arrays(Path(faces))["faces"].tolist() == [[0, 1, 2], [0, 2, 3]]
@@ -125,7 +127,7 @@ def test_a_region_can_be_an_array_or_a_file(inside: object, tmp_path: Path) -> N
         (lambda here: checked_options({"frames": 3}), "expected start:stop:step, such as 10:200:2, got 3"),
         (lambda here: checked_options(5), "options: expected a mapping .* got a value of type int"),
         (lambda here: tracks_file(object(), None, here), "tracks: expected an array of numbers or booleans, got a value of type object"),
-        (lambda here: tracks_file([[1.0], [2.0, 3.0]], None, here), "got a value of type list that is none. Pad ragged lists"),
+        (lambda here: tracks_file([[1.0], [2.0, 3.0]], None, here), "got a value of type list, which cannot be converted. Pad ragged"),
         (lambda here: tracks_file(b"x", None, here), "tracks: expected an array of numbers"),
         (lambda here: mesh_part(object(), here), "mesh: expected an array of numbers or booleans, got a value of type object"),
         (
@@ -139,7 +141,7 @@ def test_a_region_can_be_an_array_or_a_file(inside: object, tmp_path: Path) -> N
         (lambda here: existing_file(POINTS, "film"), "film: expected the path of a file, got a value of type ndarray"),
         (lambda here: region_part(POINTS, here), r"region: expected the path .* of bool or uint8, got an array of shape \(4, 9, 2\)"),
         (lambda here: region_part(POINTS[0], here), r"dtype float32\. Convert it; a polygon is the option region_polygon"),
-        (lambda here: tracks_file(io.BytesIO(b"x"), None, here), "got a value of type BytesIO that is none"),
+        (lambda here: tracks_file(io.BytesIO(b"x"), None, here), "got a value of type BytesIO, which cannot be converted"),
         (lambda here: region_part(object(), here), "region: expected an array of numbers or booleans"),
     ],
 )  # fmt: skip
@@ -177,6 +179,10 @@ def test_arguments_of_clients_and_submissions_are_checked() -> None:
         client.submit(POINTS, name=5)  # type: ignore[arg-type]
     with pytest.raises(BadArgument, match="token: expected a str"):
         Client("http://pliant.test", token=5)  # type: ignore[arg-type]
+    with pytest.raises(BadArgument, match=r"retries: expected a Retry, such as Retry\(patience=10\), got 3"):
+        Client("http://pliant.test", retries=3)  # type: ignore[arg-type]
+    with pytest.raises(BadArgument, match="limit: expected at least 0 jobs, or None for all, got -1"):
+        list(client.list(limit=-1))
     client.close()
     with pytest.raises(BadArgument, match="The client is closed"):
         client.limits()

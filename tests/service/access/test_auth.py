@@ -23,7 +23,7 @@ from pliant.worker.jobs.service import Jobs
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 from pliant.worker.tokens import Scope, Tokens
-from serving import Running, Serve, finish, form, settings_from, submit, tracks
+from serving import Running, Serve, finish, form, settings_from, submit, tracks, until
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,9 @@ def test_the_body_of_a_request_without_a_token_is_never_read(guarded: Running) -
     ("scopes", "read", "write"),
     [((Scope.READ,), 200, 403), ((Scope.SUBMIT,), 403, 415), ((Scope.ADMIN,), 200, 415)],
 )
-def test_a_scope_limits_what_a_token_can_do(guarded: Running, scopes: tuple[Scope, ...], read: int, write: int) -> None:
+def test_a_scope_limits_what_a_token_can_do(
+    guarded: Running, scopes: tuple[Scope, ...], read: int, write: int, caplog: pytest.LogCaptureFixture
+) -> None:
     with guarded.client(*scopes) as http:
         answers = {"read": http.get("/v1/jobs"), "write": http.post("/v1/jobs", content=b"x")}
         assert (answers["read"].status_code, answers["write"].status_code) == (read, write)
@@ -132,6 +134,14 @@ def test_a_scope_limits_what_a_token_can_do(guarded: Running, scopes: tuple[Scop
         if answer.status_code == 403:
             assert answer.json()["code"] == "insufficient_scope"
             assert 'error="insufficient_scope"' in answer.headers["www-authenticate"]
+    token = guarded.tokens.all()[-1].id
+    refused = [token] * [read, write].count(403)
+    until(
+        lambda: (
+            [vars(each)["token"] for each in caplog.records if vars(each).get("code") == "insufficient_scope"]
+            == refused
+        )
+    )
 
 
 def test_required_scopes_follow_from_method_and_path() -> None:

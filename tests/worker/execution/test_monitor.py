@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 import signal
 import threading
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+import redis
 from pliant.schemas.job import Interpretation, Problem, Progress, Status
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
@@ -18,12 +20,14 @@ from pliant.worker.errors import StoreUnavailable
 from pliant.worker.execution.failures import how_it_ended, out_of_memory, problem_of, timed_out
 from pliant.worker.execution.monitor import Reason, RetryDeadline, Watch, finalize
 from pliant.worker.execution.progress import FILM_SHARES, SHARES, Reporter
+from pliant.worker.execution.rq_worker import Delivery
 from pliant.worker.execution.workdir import OUTPUT, working_directory
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
 from pliant.worker.processes.containment import OomKills
 from pliant.worker.records import Change, Records, Stored
+from pliant.worker.store.queue import FUNCTION
 
 NOW = datetime(2030, 1, 1, tzinfo=UTC)
 KILLED = int(signal.SIGKILL)
@@ -115,6 +119,31 @@ def test_a_job_killed_while_its_worker_stops_is_requeued(running: Callable[..., 
         after = finalize(watch, status=status, peak=0, deadline=RetryDeadline(0))
         assert after is not None
         assert after.job.status is expected
+
+
+def test_a_job_whose_outcome_the_store_did_not_take_is_repeated(
+    jobs: Jobs, running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An outage of a minute ends as a longer one does, after which the reconciler repeats the job."""
+
+    def away(*_: object, **__: object) -> None:
+        raise StoreUnavailable("The job store", reason="refused")
+
+    def ended(code: int) -> None:
+        raise SystemExit(code)
+
+    monkeypatch.setattr("pliant.worker.execution.attempt.run", away)
+    monkeypatch.setattr("os._exit", ended)
+    delivery = Delivery.create(FUNCTION, args=("some-job", "an-attempt"), connection=redis.Redis())
+    delivery.settings = jobs.settings
+    with pytest.raises(SystemExit) as exited:
+        delivery.perform()
+    for attempts, expected in ((2, Status.QUEUED), (1, Status.FAILED)):
+        watch = running([0.0], max_attempts=attempts)
+        after = finalize(watch, status=int(str(exited.value.code)) << 8, peak=0, deadline=RetryDeadline(0))
+        assert after is not None
+        assert after.job.status is expected
+        assert "The job store did not answer when the job ended." in watch.records.log(watch.id)[0]
 
 
 def test_an_attempt_that_lost_its_job_is_killed_at_once(jobs: Jobs, running: Callable[..., Watch]) -> None:
@@ -349,5 +378,5 @@ def test_the_log_is_complete_before_the_record_is_final(
 
     monkeypatch.setattr(type(jobs.records), "update", seen)
     assert finalize(watch, status=KILLED, peak=0, deadline=RetryDeadline(0)) is not None
-    assert "SIGKILL" in logged[0]
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ .*SIGKILL.*", logged[0])
     assert logged[1:] == ["Segmentation fault"] == jobs.records.log(watch.id)[1:]

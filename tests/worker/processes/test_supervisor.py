@@ -45,10 +45,11 @@ SLEEP = "import time; time.sleep(600)"
 
 
 def test_the_log_of_a_child_that_ended_is_quoted(caplog: pytest.LogCaptureFixture) -> None:
-    supervisor = Supervisor([python("short", "raise SystemExit(3)", log_tail=lambda: "No space left on device")])
+    ended = python("short", "raise SystemExit(3)", log_tail=lambda: "Short write", cause=lambda: "The disk is full.")
+    supervisor = Supervisor([ended])
     supervisor.start()
     until(lambda: supervisor.look() or caplog.records)
-    words = "short ended with code 3. Its log ends with: No space left on device. Starting it again in"
+    words = "short ended with code 3. Its log ends with: Short write. The disk is full. Starting it again in"
     assert words in caplog.records[-1].getMessage()
     supervisor.stop()
 

@@ -18,7 +18,7 @@ from pliant.schemas.job import Status
 from pliant.worker.errors import StoreUnavailable
 from pliant.worker.jobs.retry import retry
 from pliant.worker.maintenance.fsck import findings
-from pliant.worker.processes.valkey import find_binary
+from pliant.worker.processes.valkey import disk_is_full, find_binary
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 from worker_house import House, running, settled
@@ -196,8 +196,10 @@ def test_valkey_on_a_full_disk_refuses_jobs_and_loses_none(
             while out.write(b"x" * 4096):
                 pass
         house.until(lambda: answered(False), "it refuses")
+        assert disk_is_full(small_disk)
         filler.unlink()
         house.until(lambda: answered(True), "it accepts again")
+        assert not disk_is_full(small_disk)
         assert set(accepted) <= {job.id for job in house.jobs.page(limit=200).jobs}
         # There is no reconciler here: it would queue what is not queued, and sweep a refused submission's file hours later.
         left = findings(house.jobs, pause=0)

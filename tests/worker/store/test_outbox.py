@@ -9,6 +9,7 @@ import hashlib
 import hmac
 import ipaddress
 import json
+import re
 import shutil
 import socket
 import ssl
@@ -158,6 +159,7 @@ def test_the_end_of_a_job_is_sent_once_with_signature_and_body(
     assert (event["type"], Job.model_validate(event["data"])) == ("job.cancelled", job)
     assert SECRET.encode() not in body
     until(lambda: "Webhook delivered: the receiver returned 204 (attempt 1)." in door.log(job.id))
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ Webhook delivered.*\n", door.log(job.id))
     time.sleep(0.7)
     assert len(receiver.got) == 1
 

@@ -3,6 +3,7 @@
 import { edges } from "./body";
 import type { FilmFrames } from "./filmframes";
 import { type Preview, isHidden } from "./preview";
+import { scattered } from "./scattered";
 
 /** Maximum number of points drawn over a film, so that the picture stays visible, and without one. */
 const MOST = { film: 500, plain: 3000 };
@@ -21,7 +22,7 @@ export class FilmPane {
   showsMesh = false;
   private readonly context = this.canvas.getContext("2d") as CanvasRenderingContext2D;
   private readonly frame: Frame;
-  private readonly every: number;
+  private readonly some: number[];
   private wires: Uint32Array | null = null;
   private colours = { dots: "#b4482c", wire: "#ffffff", paper: "#ffffff" };
   private time = 0;
@@ -32,7 +33,7 @@ export class FilmPane {
     private readonly residuals: Int16Array,
     private readonly film: FilmFrames | null,
   ) {
-    this.every = Math.max(1, Math.ceil(preview.points / (film ? MOST.film : MOST.plain)));
+    this.some = scattered(preview.points, film ? MOST.film : MOST.plain);
     this.frame = film ? { left: -0.5, top: -0.5, width: film.width, height: film.height } : this.around();
     this.canvas.setAttribute("role", "img");
     this.canvas.setAttribute("aria-label", film ? "The film at the same moment, with its tracks" : "The tracks at the same moment");
@@ -97,10 +98,10 @@ export class FilmPane {
   }
 
   private tracks(frame: number, at: (place: [number, number]) => [number, number], density: number): void {
-    const { preview, context } = this;
+    const { context } = this;
     context.fillStyle = context.strokeStyle = this.colours.dots;
     context.lineWidth = density;
-    for (let point = 0; point < preview.points; point += this.every) {
+    for (const point of this.some) {
       const here = this.track(frame, point);
       if (here === null) continue;
       const [x, y] = at(here);
@@ -134,7 +135,7 @@ export class FilmPane {
     const { preview } = this;
     const [low, high] = [[Infinity, Infinity], [-Infinity, -Infinity]] as [[number, number], [number, number]];
     for (let frame = 0; frame < preview.ready; frame += Math.max(1, Math.floor(preview.ready / 30))) {
-      for (let point = 0; point < preview.points; point += this.every) {
+      for (const point of this.some) {
         const place = this.track(frame, point);
         if (place === null) continue;
         for (const axis of [0, 1] as const) {

@@ -3,12 +3,13 @@
 
 import { BufferAttribute, BufferGeometry, DynamicDrawUsage, Group, LineBasicMaterial, LineSegments, Points, PointsMaterial } from "three";
 import { type Preview, isHidden } from "./preview";
+import { scattered } from "./scattered";
 
 const MOST = 1500;
 
 export class TrackDots {
   readonly group = new Group();
-  private readonly every: number;
+  private readonly some: number[];
   private readonly ends: Float32Array;
   private readonly dots: Points<BufferGeometry, PointsMaterial>;
   private readonly lines: LineSegments<BufferGeometry, LineBasicMaterial>;
@@ -17,8 +18,8 @@ export class TrackDots {
     private readonly preview: Preview,
     private readonly residuals: Int16Array,
   ) {
-    this.every = Math.max(1, Math.ceil(preview.points / MOST));
-    const most = Math.ceil(preview.points / this.every);
+    this.some = scattered(preview.points, MOST);
+    const most = this.some.length;
     this.ends = new Float32Array(6 * most);
     const geometry = (): BufferGeometry => new BufferGeometry();
     this.lines = new LineSegments(geometry(), new LineBasicMaterial());
@@ -46,7 +47,7 @@ export class TrackDots {
     const back = header.residual_step / scale;
     const dots = this.dots.geometry.getAttribute("position").array as Float32Array;
     let shown = 0;
-    for (let point = 0; point < points; point += this.every) {
+    for (const point of this.some) {
       const from = points * frame + point;
       const [u, v] = [this.residuals[2 * from] as number, this.residuals[2 * from + 1] as number];
       if (isHidden(u)) continue;
