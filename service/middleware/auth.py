@@ -122,9 +122,7 @@ class Authentication:
         if token is None:
             detail = "The token is not known; it may have been revoked. Ask the operator for a new one."
             return _unauthorized(ProblemCode.INVALID_TOKEN, detail)
-        scope["pliant.token"] = (
-            token  # from here on it is known whose request this is: the access log names a refused one, too
-        )
+        scope["pliant.token"] = token  # the access log names the token of a refused request, too
         if token.expired(utc_now()):
             detail = "The token has expired. Ask the operator for a new one."
             return _unauthorized(ProblemCode.EXPIRED_TOKEN, detail)
