@@ -38,7 +38,7 @@ class Aimed:
     """What the change of variables adds to the negative log likelihood per point and frame."""
 
     @classmethod
-    def of(cls, views: Floats, curvature: float) -> Aimed:
+    def of(cls, views: Floats, inverse_focal: float) -> Aimed:
         """Turn the cameras of images `(F, P, 2)`, relative to the principal point, in units where the focal length is 1/κ.
 
         Raises
@@ -47,11 +47,11 @@ class Aimed:
             With this κ, some points of the object lie behind a turned camera.
         """
         middle = views.mean(axis=1)
-        turns = towards(middle, curvature)
+        turns = towards(middle, inverse_focal)
         cosine = turns[:, 2, 2]
         # For κ = 0 the third column of a turn is 0, and the object moves to the principal point by this difference of image points.
         shifted = views @ turns[:, :2, :2].transpose(0, 2, 1) - (cosine[:, None] * middle)[:, None]
-        ahead = curvature * np.einsum("fc,fpc->fp", turns[:, 2, :2], views) + cosine[:, None]
+        ahead = inverse_focal * np.einsum("fc,fpc->fp", turns[:, 2, :2], views) + cosine[:, None]
         if not ahead.min() > 0:
             raise np.linalg.LinAlgError("points lie behind a turned camera")
         change = 3 * float(np.log(ahead).mean()) + 2 * float(np.log(cosine).mean())
@@ -63,11 +63,11 @@ class Aimed:
         return cls(views, np.tile(np.eye(3), (len(views), 1, 1)), 0.0)
 
     @classmethod
-    def with_slopes(cls, views: Floats, curvature: float) -> tuple[Aimed, Floats, float]:
+    def with_slopes(cls, views: Floats, inverse_focal: float) -> tuple[Aimed, Floats, float]:
         """Return the turned images, and the derivatives of images and density with respect to κ."""
-        before, after = (cls.of(views, curvature + step) for step in (-STEP, STEP))
+        before, after = (cls.of(views, inverse_focal + step) for step in (-STEP, STEP))
         slope = (after.views - before.views) / (2 * STEP)
-        return cls.of(views, curvature), slope, (after.density - before.density) / (2 * STEP)
+        return cls.of(views, inverse_focal), slope, (after.density - before.density) / (2 * STEP)
 
     def turned(self, rotations: Floats) -> Floats:
         """Return the rotations of the turned cameras for those of the original cameras, `(F, 3, 3)`."""
@@ -79,9 +79,9 @@ class Aimed:
         return replace(depth, away=cosine * depth.away) if isinstance(depth, DepthMap) else np.asarray(cosine * depth)
 
 
-def towards(points: Floats, curvature: float) -> Floats:
+def towards(points: Floats, inverse_focal: float) -> Floats:
     """Return the smallest rotations `(F, 3, 3)` that turn the rays through image points `(F, 2)` onto the optical axis."""
-    x, y = curvature * points.T
+    x, y = inverse_focal * points.T
     z = 1 / np.sqrt(1 + x**2 + y**2)
     x, y = x * z, y * z
     rows = [

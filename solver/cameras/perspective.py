@@ -64,7 +64,7 @@ class DepthMap:
 class Candidate:
     """A value of κ that was compared, and its score."""
 
-    curvature: float
+    inverse_focal: float
     """κ, inverse normalized units; if negative, depth is minus the third camera coordinate."""
 
     nll: float
@@ -81,10 +81,10 @@ class Perspective:
     principal_point: Floats
     """Shape `(2,)`, the tracks' unit."""
 
-    curvature: float = 0.0
+    inverse_focal: float = 0.0
     """κ = 1/φ, inverse normalized units; 0: orthography. Its final sign is `signs[0]`: positive if the third axis points away."""
 
-    curvature_std: float | None = None
+    inverse_focal_std: float | None = None
     """Standard deviation of κ; None if κ is given, or no values on both sides of it were compared."""
 
     given: float | None = None
@@ -97,7 +97,7 @@ class Perspective:
     """Whether the camera model is `perspective`; κ = 0 then serves only for comparison."""
 
     flipped: int = 1
-    """−1 if all depths, and the sign of `curvature`, were reversed after the comparison."""
+    """−1 if all depths, and the sign of `inverse_focal`, were reversed after the comparison."""
 
     sign_known: bool = False
     """Whether the sign of depth is known."""
@@ -121,13 +121,13 @@ class Perspective:
     @property
     def is_perspective(self) -> bool:
         """Whether the tracks are corrected for perspective."""
-        return self.curvature != 0
+        return self.inverse_focal != 0
 
     def focal_std(self, unit: float) -> float | None:
         """Return the standard deviation of φ, 0 if φ is given, None if unknown; a normalized unit is `unit` of the result."""
         if self.given is not None:
             return 0.0
-        return None if self.curvature_std is None else unit * self.curvature_std / self.curvature**2
+        return None if self.inverse_focal_std is None else unit * self.inverse_focal_std / self.inverse_focal**2
 
 
 def depth_map(rotations: Floats, scales: Floats, covariance: ShapeCovariance) -> Floats | DepthMap:
@@ -145,7 +145,7 @@ def depth_map(rotations: Floats, scales: Floats, covariance: ShapeCovariance) ->
 def depths_of(
     depth: Floats | DepthMap,
     views: Floats,
-    curvature: float,
+    inverse_focal: float,
     *,
     origin: Floats | None = None,
 ) -> Floats:
@@ -157,14 +157,14 @@ def depths_of(
         From `depth_map`.
     views : array, shape (F, P, 2)
         Complete tracks relative to the principal point, normalized units.
-    curvature : float
+    inverse_focal : float
         κ.
     origin : array, shape (F, 1), optional
         From `mean_depth`, for some of the points: their own mean would be another origin than that of the others.
     """
     depths = np.zeros(views.shape[:2])
-    for _ in range(DEPTH_STEPS if curvature else 1):
-        images = corrected(views, depths, curvature)
+    for _ in range(DEPTH_STEPS if inverse_focal else 1):
+        images = corrected(views, depths, inverse_focal)
         if origin is None:
             depths = depth @ columns(centred(images))
             depths -= depths.mean(axis=1, keepdims=True)
@@ -183,14 +183,14 @@ def mean_depth(view: Perspective) -> Floats:
     return np.asarray(view.depth @ columns(images.mean(axis=1, keepdims=True)))
 
 
-def corrected(views: Floats, depths: Floats, curvature: float) -> Floats:
+def corrected(views: Floats, depths: Floats, inverse_focal: float) -> Floats:
     """Return v (1 + κz): the scaled-orthographic tracks of the same shapes, about the principal point, shape `(F, P, 2)`."""
-    return np.asarray(views * np.maximum(1 + curvature * depths, MIN_RELATIVE_DISTANCE)[..., None])
+    return np.asarray(views * np.maximum(1 + inverse_focal * depths, MIN_RELATIVE_DISTANCE)[..., None])
 
 
-def density(depths: Floats, curvature: float) -> float:
+def density(depths: Floats, inverse_focal: float) -> float:
     """Return −2 mean log(1 + κz): what the change of variables u → u (1 + κz) adds to the negative log likelihood."""
-    return -2 * float(np.log(np.maximum(1 + curvature * depths, MIN_RELATIVE_DISTANCE)).mean())
+    return -2 * float(np.log(np.maximum(1 + inverse_focal * depths, MIN_RELATIVE_DISTANCE)).mean())
 
 
 def mirrored(rotations: Floats, covariance: ShapeCovariance) -> tuple[Floats, ShapeCovariance]:
@@ -230,7 +230,7 @@ def corrected_moments(view: Perspective, normalized: Normalized) -> tuple[Floats
 
 
 def _corrected_by(view: Perspective, views: Floats, origin: Floats | None = None) -> Floats:
-    return corrected(views, depths_of(view.depth, views, view.curvature, origin=origin), view.curvature)
+    return corrected(views, depths_of(view.depth, views, view.inverse_focal, origin=origin), view.inverse_focal)
 
 
 def posterior_depths(view: Perspective, normalized: Normalized) -> Floats:
@@ -238,7 +238,7 @@ def posterior_depths(view: Perspective, normalized: Normalized) -> Floats:
     found, origin = np.zeros(normalized.visible.shape), mean_depth(view)
     for places, points in spans(normalized, view.filling):
         views = points + view.offsets[:, None]
-        found[:, places] = depths_of(view.depth, views, view.curvature, origin=origin)
+        found[:, places] = depths_of(view.depth, views, view.inverse_focal, origin=origin)
     return found
 
 
@@ -255,5 +255,5 @@ def orthographic(normalized: Normalized, view: Perspective | None) -> Normalized
 def corrected_tracks(normalized: Normalized, view: Perspective, depths: Floats) -> Normalized:
     """Return the tracks corrected with depths `(F, P)`, relative to the centroids of the uncorrected tracks."""
     views = normalized.points + view.offsets[:, None]
-    points = corrected(views, depths, view.curvature) - view.offsets[:, None]
+    points = corrected(views, depths, view.inverse_focal) - view.offsets[:, None]
     return replace(normalized, points=np.where(normalized.visible[..., None] > 0, points, 0.0))

@@ -101,12 +101,12 @@ class Views:
     """Tracks of the points in the frames to resect."""
 
     points: Floats
-    """Shape `(n, 2, S)`, relative to the principal point if `curvature` is not 0."""
+    """Shape `(n, 2, S)`, relative to the principal point if `inverse_focal` is not 0."""
 
     weight: Floats
     """Shape `(n, S)`."""
 
-    curvature: float = 0.0
+    inverse_focal: float = 0.0
     """κ."""
 
     def part(self, chosen: slice | NDArray[np.intp]) -> Views:
@@ -257,14 +257,14 @@ class _Fit:
     """Negative log posterior, shape `(n,)`."""
 
 
-def predicted(shapes: MeanShapes, poses: Poses, curvature: float) -> tuple[Floats, Floats, Floats]:
+def predicted(shapes: MeanShapes, poses: Poses, inverse_focal: float) -> tuple[Floats, Floats, Floats]:
     """Return s R x `(n, 3, S)`, the images under orthography, translations included `(n, 2, S)`, and 1 + κz `(n, S)`."""
     turned = poses.scales[:, None, None] * (poses.rotations @ shapes.at(poses.coefficients))
     depths = turned[:, 2] - turned[:, 2].mean(axis=1, keepdims=True)
     return (
         turned,
         turned[:, :2] + poses.translations[:, :, None],
-        np.maximum(1 + curvature * depths, MIN_RELATIVE_DISTANCE),
+        np.maximum(1 + inverse_focal * depths, MIN_RELATIVE_DISTANCE),
     )
 
 
@@ -274,7 +274,7 @@ def _turn(poses: Poses) -> Floats:
 
 
 def _fit(views: Views, shapes: MeanShapes, poses: Poses) -> _Fit:
-    turned, image, nearer = predicted(shapes, poses, views.curvature)
+    turned, image, nearer = predicted(shapes, poses, views.inverse_focal)
     left = views.points * nearer[:, None] - image
     far = OUTLYING**2 * shapes.variance
     squared = (left**2).sum(axis=1)

@@ -37,10 +37,12 @@ def with_camera_choice(
     plain = settings.camera if settings.camera == "orthographic" else "scaled_orthographic"
     if view is None:
         return replace(choices, camera=plain, depth_sign="settled" if given else "ambiguous")
-    chosen = view.signs[0] if not view.is_perspective else float(np.sign(view.flipped * view.curvature))
+    chosen = view.signs[0] if not view.is_perspective else float(np.sign(view.flipped * view.inverse_focal))
     candidates = tuple(
         FocalCandidate(
-            unit / abs(each.curvature) if each.curvature else None, bool(each.curvature * chosen < 0), each.nll
+            unit / abs(each.inverse_focal) if each.inverse_focal else None,
+            bool(each.inverse_focal * chosen < 0),
+            each.nll,
         )
         for each in view.candidates
     )
@@ -57,7 +59,7 @@ def with_camera_choice(
 
 def described(view: Perspective, unit: float) -> str:
     """Return a sentence about the choice between orthography and perspective."""
-    nll = {each.curvature: each.nll for each in view.candidates}
+    nll = {each.inverse_focal: each.nll for each in view.candidates}
     if not view.is_perspective:
         best = min((each for each in nll if each != 0), key=lambda each: nll[each], default=None)
         if best is None:
@@ -71,7 +73,7 @@ def described(view: Perspective, unit: float) -> str:
     std = view.focal_std(unit)
     how = "as given" if view.given is not None else "" if std is None else f"± {float(f'{std:.2g}'):g} from noise alone"
     gains = f"gains {nll[0.0] - own:.3f} in the log likelihood per point and frame over orthography"
-    length = f"{unit / abs(view.curvature):.4g} {how}".strip()
+    length = f"{unit / abs(view.inverse_focal):.4g} {how}".strip()
     if own >= UNLIKELY:
         return f"Perspective with focal length {length}: {DIVERGED}."
     if view.given is not None:

@@ -229,6 +229,6 @@ def camera_of(estimate: CameraEstimate, observations: Observations) -> Camera:
     if view is not None:
         camera = replace(camera, principal_point=np.array(view.principal_point))
     if view is not None and view.is_perspective:
-        focal = normalized.unit / abs(view.curvature)
+        focal = normalized.unit / abs(view.inverse_focal)
         camera = replace(camera, focal=focal, focal_std=view.focal_std(normalized.unit))
     return camera

@@ -86,7 +86,7 @@ def _views(observations: Observations, estimate: CameraEstimate, chosen: NDArray
     weight = normalized.visible[:, chosen]
     if view is None or not view.is_perspective or observations.lens is None:
         return Views(np.ascontiguousarray(points), weight)
-    return Views(points + observations.lens.offsets[:, :, None], weight, view.curvature)
+    return Views(points + observations.lens.offsets[:, :, None], weight, view.inverse_focal)
 
 
 def _completed(views: Views, shapes: MeanShapes, poses: Poses) -> Floats:
@@ -100,12 +100,12 @@ def _filled(views: Views, shapes: MeanShapes, poses: Poses, *, as_seen: bool) ->
     std = shapes.variance**0.5
     for low in range(0, len(views.points), PREDICTED_TOGETHER):
         part = slice(low, low + PREDICTED_TOGETHER)
-        _, image, nearer = predicted(shapes, poses.part(part), views.curvature)
+        _, image, nearer = predicted(shapes, poses.part(part), views.inverse_focal)
         seen, guess = (each.transpose(0, 2, 1) for each in (views.points[part], image))
-        if views.curvature and as_seen:
+        if views.inverse_focal and as_seen:
             guess = guess / nearer[..., None]
-        elif views.curvature:
-            seen = corrected(seen, (nearer - 1) / views.curvature, views.curvature)
+        elif views.inverse_focal:
+            seen = corrected(seen, (nearer - 1) / views.inverse_focal, views.inverse_focal)
         trust = np.where(gross(seen, views.weight[part], guess, std), 0.0, views.weight[part])[..., None]
         done.append(np.where(trust == 1, seen, guess + trust * (seen - guess)))
     return np.concatenate(done)
@@ -129,7 +129,7 @@ def _whole(
     sample = _completed(views, shapes, poses)
     clean = estimate.filling is None and bool((observations.normalized.visible == 1).all())
     moved = poses.translations
-    if views.curvature and observations.lens is not None:
+    if views.inverse_focal and observations.lens is not None:
         moved = moved - observations.lens.offsets
     turn = float(np.degrees(angles_between(poses.rotations, begun).mean()))
     reasons = dict(estimate.reasons)
@@ -142,7 +142,7 @@ def _whole(
         read_only(array)
     filling = None if clean else _filling(whole, rotations, scales, poses, shapes)
     estimate = replace(
-        estimate, rotations=rotations, scales=scales, translations=np.zeros_like(moved) if clean and not views.curvature else moved,
+        estimate, rotations=rotations, scales=scales, translations=np.zeros_like(moved) if clean and not views.inverse_focal else moved,
         sample=sample, reasons=reasons, hypotheses=(), candidates=(), filling=filling,
         perspective=_perspective(estimate, observations, views, shapes, poses, whole, rotations, scales, filling),
     )  # fmt: skip

@@ -16,7 +16,7 @@ from pliant.solver.cameras.perspective import Perspective, corrected, depth_map,
 from pliant.solver.records import Floats
 from pliant.solver.refinement.depth_alternation import aligned
 from pliant.solver.refinement.focal_length import (
-    CURVATURES,
+    INVERSE_FOCALS,
     SEARCH_EM_ROUNDS,
     SEARCH_ITERATIONS,
     compared_frames,
@@ -32,7 +32,7 @@ ITERATIONS = 3
 """Corrections at each κ. Measured on a tearing sheet, an arm and a stick figure (`benchmarks.accuracy.kinds`): rotations
 stop improving after one to four."""
 
-FIRST_CURVATURE = CURVATURES[len(CURVATURES) // 2]
+FIRST_INVERSE_FOCAL = INVERSE_FOCALS[len(INVERSE_FOCALS) // 2]
 """κ, inverse RMS radii, at which every K and both signs of depth are tried; larger and smaller ones follow from the best."""
 
 
@@ -41,7 +41,7 @@ class _Trial:
     """Cameras from affine iterations at one κ, their covariance, and how probable the tracks are with both."""
 
     size: int
-    curvature: float
+    inverse_focal: float
     found: Learned
     nll: float
 
@@ -70,7 +70,7 @@ def affine_iterations(
     """
     used = compared_frames(views)
     part = _Iterations(views[used], rotations[used], scales[used], how)
-    first = FIRST_CURVATURE if view.given is None else view.given
+    first = FIRST_INVERSE_FOCAL if view.given is None else view.given
     trials: list[_Trial] = []
     for size in SIZES:
         if how.should_stop() or 3 * size > min(2 * len(used), views.shape[1]):
@@ -82,19 +82,21 @@ def affine_iterations(
     best = min(trials, key=lambda trial: trial.nll)
     if view.given is None:
         best = _continued(part, best)
-    if best.nll >= min((each.nll for each in view.candidates if each.curvature == view.curvature), default=np.inf):
+    if best.nll >= min(
+        (each.nll for each in view.candidates if each.inverse_focal == view.inverse_focal), default=np.inf
+    ):
         return None
     every = _Iterations(views, rotations, scales, how)
-    return every.iterated(best.size, best.curvature, every.factorized(best.size)).found, best.curvature
+    return every.iterated(best.size, best.inverse_focal, every.factorized(best.size)).found, best.inverse_focal
 
 
 def _continued(part: _Iterations, best: _Trial) -> _Trial:
     """Return the best of larger values of κ, one by one while the likelihood rises, or of smaller ones if it does not rise at all."""
-    middle = CURVATURES.index(abs(best.curvature))
-    for sizes in (CURVATURES[middle + 1 :], CURVATURES[middle - 1 :: -1]):
+    middle = INVERSE_FOCALS.index(abs(best.inverse_focal))
+    for sizes in (INVERSE_FOCALS[middle + 1 :], INVERSE_FOCALS[middle - 1 :: -1]):
         start = best
         for size in sizes:
-            trial = part.iterated(best.size, float(np.copysign(size, best.curvature)), best.found)
+            trial = part.iterated(best.size, float(np.copysign(size, best.inverse_focal)), best.found)
             if trial.nll >= best.nll:
                 break
             best = trial
@@ -116,25 +118,27 @@ class _Iterations:
         """Return cameras and covariance from the uncorrected tracks."""
         return self._factorized(self.views, size, self.rotations)
 
-    def iterated(self, size: int, curvature: float, start: Learned) -> _Trial:
+    def iterated(self, size: int, inverse_focal: float, start: Learned) -> _Trial:
         """Return the trial after `ITERATIONS` corrections, or as many as do not diverge."""
         found = start
         for _ in range(ITERATIONS):
             try:
-                depths = depths_of(depth_map(found.rotations, found.scales, found.covariance), self.views, curvature)
-                found = self._factorized(corrected(self.views, depths, curvature), size, found.rotations)
+                depths = depths_of(
+                    depth_map(found.rotations, found.scales, found.covariance), self.views, inverse_focal
+                )
+                found = self._factorized(corrected(self.views, depths, inverse_focal), size, found.rotations)
             except np.linalg.LinAlgError:
                 break
-        return self._rated(size, curvature, found)
+        return self._rated(size, inverse_focal, found)
 
-    def _rated(self, size: int, curvature: float, found: Learned) -> _Trial:
+    def _rated(self, size: int, inverse_focal: float, found: Learned) -> _Trial:
         try:
             refined, _ = refine_with_focal(
-                self.views, found, curvature, free=False, turning=True, iterations=SEARCH_ITERATIONS
+                self.views, found, inverse_focal, free=False, turning=True, iterations=SEARCH_ITERATIONS
             )
         except np.linalg.LinAlgError:  # the depths diverge
-            return _Trial(size, curvature, found, np.inf)
-        return _Trial(size, curvature, found, refined.energy)
+            return _Trial(size, inverse_focal, found, np.inf)
+        return _Trial(size, inverse_focal, found, refined.energy)
 
     def _factorized(self, images: Floats, size: int, like: Floats) -> Learned:
         rows = columns(centred(images)) / np.repeat(self.scales, 2)[:, None]

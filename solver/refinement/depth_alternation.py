@@ -59,11 +59,13 @@ def alternate(
         if how.should_stop():
             break
         try:
-            found = _relearned(views, view.curvature, found, how)
+            found = _relearned(views, view.inverse_focal, found, how)
         except np.linalg.LinAlgError:
             break
-        found, curvature = refine_with_focal(views, found, view.curvature, free=view.given is None, turning=how.turning)
-        view = replace(view, curvature=curvature)
+        found, inverse_focal = refine_with_focal(
+            views, found, view.inverse_focal, free=view.given is None, turning=how.turning
+        )
+        view = replace(view, inverse_focal=inverse_focal)
     return found, view
 
 
@@ -100,7 +102,7 @@ def refactorize(
         moved, _ = alternate(view, start, some, replace(how, should_stop=never), rounds=1)
         return moved.energy
 
-    turns = towards(view.learning_sample.mean(axis=1), view.curvature)
+    turns = towards(view.learning_sample.mean(axis=1), view.inverse_focal)
     rows = columns(_turned(view, turns) / scales[:, None, None])
     gram = gram_of(rows)
     limit = min(len(gram) // 3, view.learning_sample.shape[1] // 3)
@@ -117,8 +119,8 @@ def refactorize(
 
 def _turned(view: Perspective, turns: Floats) -> Floats:
     """Return the corrected and centred tracks of the sample, `(F, S, 2)`, seen by turned cameras."""
-    depths = depths_of(view.depth, view.learning_sample, view.curvature)
-    images = centred(corrected(view.learning_sample, depths, view.curvature))
+    depths = depths_of(view.depth, view.learning_sample, view.inverse_focal)
+    images = centred(corrected(view.learning_sample, depths, view.inverse_focal))
     depths -= depths.mean(axis=1, keepdims=True)
     return np.asarray(images @ turns[:, :2, :2].transpose(0, 2, 1) + depths[..., None] * turns[:, None, :2, 2])
 
@@ -132,11 +134,11 @@ def aligned(rotations: Floats, like: Floats, used: NDArray[np.intp]) -> Floats:
     return np.asarray(min(choices, key=lambda choice: choice[0])[1])
 
 
-def _relearned(views: Floats, curvature: float, found: Learned, how: Refinement) -> Learned:
+def _relearned(views: Floats, inverse_focal: float, found: Learned, how: Refinement) -> Learned:
     """Return `found` with the covariance of the tracks corrected with its depths; `views` has shape `(F', S, 2)`."""
-    aimed = Aimed.of(views, curvature) if how.turning else Aimed.unturned(views)
+    aimed = Aimed.of(views, inverse_focal) if how.turning else Aimed.unturned(views)
     rotations = aimed.turned(found.rotations)
-    depths = depths_of(aimed.depth_map(rotations, found.scales, found.covariance), aimed.views, curvature)
-    flat = corrected(aimed.views, depths, curvature)
+    depths = depths_of(aimed.depth_map(rotations, found.scales, found.covariance), aimed.views, inverse_focal)
+    flat = corrected(aimed.views, depths, inverse_focal)
     again = how.anneal(flat, rotations, found.scales, iterations=ALTERNATION_EM_ROUNDS)
     return replace(found, covariance=again.covariance)

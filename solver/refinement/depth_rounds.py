@@ -55,15 +55,15 @@ def correct_perspective(evidence: Evidence, how: Refinement) -> Evidence:
     start = affine_iterations(*cameras, view, how)
     if start is None:
         return reached
-    found, curvature = start
-    other, found = _restart(*_correct_from(evidence, found, replace(view, curvature=curvature), how), how)
+    found, inverse_focal = start
+    other, found = _restart(*_correct_from(evidence, found, replace(view, inverse_focal=inverse_focal), how), how)
     return other if found.energy < best.energy - MIN_GAIN else reached
 
 
 def _correct_from(evidence: Evidence, found: Learned, view: Perspective, how: Refinement) -> tuple[Evidence, Learned]:
     """Return the evidence with the tracks corrected after alternation from `found` and κ, with κ positive where z points away."""
-    if view.curvature * view.signs[0] < 0:
-        view = replace(view, curvature=-view.curvature, flipped=-1)
+    if view.inverse_focal * view.signs[0] < 0:
+        view = replace(view, inverse_focal=-view.inverse_focal, flipped=-1)
         turned, covariance = mirrored(found.rotations, found.covariance)
         found = replace(found, rotations=turned, covariance=covariance)
         estimate = evidence.estimate
@@ -112,8 +112,10 @@ def with_stretched_depth(evidence: Evidence, found: Learned, stretch: float) -> 
     """
     view = evidence.estimate.perspective
     assert view is not None
-    curvature, std = view.curvature / stretch, (view.curvature_std or 0.0) / stretch
-    view = replace(view, curvature=curvature, curvature_std=float(np.hypot(std, LOG_DEPTH_STD * curvature)))
+    inverse_focal, std = view.inverse_focal / stretch, (view.inverse_focal_std or 0.0) / stretch
+    view = replace(
+        view, inverse_focal=inverse_focal, inverse_focal_std=float(np.hypot(std, LOG_DEPTH_STD * inverse_focal))
+    )
     return _with_corrected_tracks(
         evidence, replace(found, scales=found.scales * evidence.start_scales[evidence.used]), view
     )

@@ -41,7 +41,7 @@ from pliant.solver.refinement.learned import Learned, Refinement, motion_of, mov
 from pliant.solver.tracks.frame_selection import evenly_spread
 from pliant.solver.tracks.matrix import centred, columns
 
-CURVATURES = (0.02, 0.035, 0.06, 0.1, 0.16, 0.25, 0.38)
+INVERSE_FOCALS = (0.02, 0.035, 0.06, 0.1, 0.16, 0.25, 0.38)
 """Values of κ compared, in inverse RMS radii of the tracks, each with both signs. At .02 the correction is 1 % to 2 % of a position; at
 .38 an object fills 80° of the view."""
 
@@ -81,7 +81,7 @@ UPDATE_ITERATIONS = 60
 class _Trial:
     """A value of κ with the cameras and the covariance refined for it."""
 
-    curvature: float
+    inverse_focal: float
     nll: float
     found: Learned
 
@@ -104,7 +104,7 @@ def search(
     scales : array, shape (F,)
         Their scales.
     view : Perspective
-        Given parameters. The `curvature` returned has the sign opposite to `signs[0]` if depths must be mirrored.
+        Given parameters. The `inverse_focal` returned has the sign opposite to `signs[0]` if depths must be mirrored.
     how : Refinement
         What is refined; scales are if any differs from 1.
     """
@@ -122,7 +122,7 @@ def search(
     if _promising(view, comparison.trials):
         comparison.level()
     view = _decided(view, comparison.trials, len(used), views.shape[1])
-    found = comparison.trials[view.curvature if view.curvature in comparison.trials else 0.0].found
+    found = comparison.trials[view.inverse_focal if view.inverse_focal in comparison.trials else 0.0].found
     return view, to_all_frames(found, used, rotations)
 
 
@@ -147,10 +147,10 @@ class _Comparison:
         comparison.trials[0.0] = comparison._continued(flat, 0.0)
         return comparison
 
-    def add(self, curvature: float) -> None:
+    def add(self, inverse_focal: float) -> None:
         """Add a value of κ, continued from the next smaller one of its sign."""
-        nearest = max((each for each in self.trials if 0 <= each / curvature < 1), key=abs)
-        self.trials[curvature] = self._continued(self.trials[nearest], curvature)
+        nearest = max((each for each in self.trials if 0 <= each / inverse_focal < 1), key=abs)
+        self.trials[inverse_focal] = self._continued(self.trials[nearest], inverse_focal)
 
     def level(self) -> None:
         """Continue every value of κ from both neighbours where that is more probable, so that all are refined equally well."""
@@ -165,20 +165,20 @@ class _Comparison:
             if found.nll < self.trials[target].nll:
                 self.trials[target] = found
 
-    def _continued(self, trial: _Trial, curvature: float) -> _Trial:
+    def _continued(self, trial: _Trial, inverse_focal: float) -> _Trial:
         """Return the trial of κ with depths, cameras and covariance refined from those of `trial`."""
         found = trial.found
         if self.how.turning:
             middle = self.views.mean(axis=1)
-            turns = towards(middle, curvature).transpose(0, 2, 1) @ towards(middle, trial.curvature)
+            turns = towards(middle, inverse_focal).transpose(0, 2, 1) @ towards(middle, trial.inverse_focal)
             found = replace(found, rotations=turns @ found.rotations)
         try:
             found, _ = refine_with_focal(
-                self.views, found, curvature, free=False, turning=self.how.turning, iterations=SEARCH_ITERATIONS
+                self.views, found, inverse_focal, free=False, turning=self.how.turning, iterations=SEARCH_ITERATIONS
             )
         except np.linalg.LinAlgError:  # the depths diverge
-            return _Trial(curvature, UNLIKELY, found)
-        return _Trial(curvature, found.energy, found)
+            return _Trial(inverse_focal, UNLIKELY, found)
+        return _Trial(inverse_focal, found.energy, found)
 
 
 def _walk(view: Perspective, trials: dict[float, _Trial]) -> Iterator[tuple[float, int]]:
@@ -193,7 +193,7 @@ def _walk(view: Perspective, trials: dict[float, _Trial]) -> Iterator[tuple[floa
         )
         return
     signs = list(view.signs)
-    for index, size in enumerate(CURVATURES):
+    for index, size in enumerate(INVERSE_FOCALS):
         for sign in signs:
             yield size, sign
         done = [trials[sign * size].nll for sign in signs if sign * size in trials]
@@ -258,18 +258,18 @@ def _decided(view: Perspective, trials: dict[float, _Trial], frames: int, points
     else:
         best = _best(trials)
     if best not in trials or best == 0:  # stopped
-        return replace(view, curvature=best, candidates=candidates)
+        return replace(view, inverse_focal=best, candidates=candidates)
     nll = trials[best].nll
-    opposite = min((each.nll for each in candidates if each.curvature * best < 0), default=np.inf)
+    opposite = min((each.nll for each in candidates if each.inverse_focal * best < 0), default=np.inf)
     sign_known = len(view.signs) == 1 or bool(np.isfinite(opposite) and opposite - nll > MIN_PERSPECTIVE_GAIN)
     needed = trials[0.0].nll - nll > max(MIN_PERSPECTIVE_GAIN, MIN_TOTAL_GAIN / (frames * points)) and sign_known
     if not (needed or view.required or view.given is not None):
-        return replace(view, curvature=0.0, candidates=candidates)
+        return replace(view, inverse_focal=0.0, candidates=candidates)
     std, found = None, _around(trials)
     if view.given is None and found is not None:
         bend = max(_parabola(*found)[1], 1e-12)
         std = float(1 / np.sqrt(bend * frames * min(points, 1 / CAMERA_PRIOR_WEIGHT)))
-    return replace(view, curvature=best, curvature_std=std, candidates=candidates, sign_known=sign_known)
+    return replace(view, inverse_focal=best, inverse_focal_std=std, candidates=candidates, sign_known=sign_known)
 
 
 def more_probable(view: Perspective) -> tuple[float, float] | None:
@@ -279,7 +279,7 @@ def more_probable(view: Perspective) -> tuple[float, float] | None:
     """
     if view.given is None:
         return None
-    nll = {each.curvature: each.nll for each in view.candidates}
+    nll = {each.inverse_focal: each.nll for each in view.candidates}
     own = min((nll[each] for each in (view.given, -view.given) if each in nll), default=np.inf)
     best = min(nll, key=lambda each: nll[each], default=0.0)
     if not np.isfinite(own) or own - nll.get(best, np.inf) <= MIN_PERSPECTIVE_GAIN:
@@ -293,8 +293,8 @@ def unclear_perspective(view: Perspective) -> float | None:
     Values of κ below the smallest of the grid, where perspective makes no difference, do not count. Nor does a given focal length or
     camera model, about which the tracks were not asked.
     """
-    nll = {each.curvature: each.nll for each in view.candidates if abs(each.curvature) >= CURVATURES[0]}
-    flat = next((each.nll for each in view.candidates if each.curvature == 0), None)
+    nll = {each.inverse_focal: each.nll for each in view.candidates if abs(each.inverse_focal) >= INVERSE_FOCALS[0]}
+    flat = next((each.nll for each in view.candidates if each.inverse_focal == 0), None)
     if view.given is not None or view.required or flat is None or not nll:
         return None
     best = min(nll, key=lambda each: nll[each])
@@ -304,7 +304,7 @@ def unclear_perspective(view: Perspective) -> float | None:
 def refine_with_focal(
     views: Floats,
     found: Learned,
-    curvature: float,
+    inverse_focal: float,
     *,
     free: bool,
     turning: bool,
@@ -318,7 +318,7 @@ def refine_with_focal(
         Complete tracks relative to the principal point, normalized units.
     found : Learned
         Cameras and covariance to start from; scales that are all 1 are kept.
-    curvature : float
+    inverse_focal : float
         κ to start from.
     free : bool
         False keeps κ.
@@ -327,12 +327,12 @@ def refine_with_focal(
     iterations : int
         L-BFGS iterations.
     """
-    turns = towards(views.mean(axis=1), curvature)
+    turns = towards(views.mean(axis=1), inverse_focal)
     start = replace(found, rotations=turns @ found.rotations) if turning else found
-    energy = CorrectedEnergy(views, curvature, start, turning=turning)
+    energy = CorrectedEnergy(views, inverse_focal, start, turning=turning)
     motion = motion_of(energy.scene, start)
     held = 0 if turning else 3 * len(views)
-    given = np.append(motion.flat(), curvature)
+    given = np.append(motion.flat(), inverse_focal)
 
     def objective(moving: Floats) -> tuple[float, Floats]:
         value, gradient = energy(np.concatenate([given[:held], moving]))
@@ -354,15 +354,15 @@ class CorrectedEnergy:
     `found`. Rotations that are known are not: they would have to turn with κ. Scales are free if any in `found` differs from 1.
     """
 
-    def __init__(self, views: Floats, curvature: float, found: Learned, *, turning: bool = True) -> None:
+    def __init__(self, views: Floats, inverse_focal: float, found: Learned, *, turning: bool = True) -> None:
         count = views.shape[1]
         aimed, slope, self.density_slope = Aimed.unturned(views), np.zeros_like(views), 0.0
         if turning:
-            aimed, slope, self.density_slope = Aimed.with_slopes(views, curvature)
-        depths = depths_of(aimed.depth_map(found.rotations, found.scales, found.covariance), aimed.views, curvature)
-        changed = slope * (1 + curvature * depths)[..., None] + aimed.views * depths[..., None]
-        plain, along = columns(centred(corrected(aimed.views, depths, curvature))), columns(centred(changed))
-        self.depths, self.curvature, self.density = depths, curvature, aimed.density
+            aimed, slope, self.density_slope = Aimed.with_slopes(views, inverse_focal)
+        depths = depths_of(aimed.depth_map(found.rotations, found.scales, found.covariance), aimed.views, inverse_focal)
+        changed = slope * (1 + inverse_focal * depths)[..., None] + aimed.views * depths[..., None]
+        plain, along = columns(centred(corrected(aimed.views, depths, inverse_focal))), columns(centred(changed))
+        self.depths, self.inverse_focal, self.density = depths, inverse_focal, aimed.density
         self.grams = (plain @ plain.T / count, (plain @ along.T + along @ plain.T) / count, along @ along.T / count)
         self.scene = scene_at(
             self.grams[0], found.rotations, with_scales=found.scaled, ordered=found.covariance.ordered
@@ -370,9 +370,9 @@ class CorrectedEnergy:
 
     def __call__(self, flat: Floats) -> tuple[float, Floats]:
         """Return E and its gradient."""
-        frames, curvature = len(self.depths), float(flat[-1])
+        frames, inverse_focal = len(self.depths), float(flat[-1])
         constant, linear, square = self.grams
-        nearer, more = 1 + curvature * self.depths, curvature - self.curvature
+        nearer, more = 1 + inverse_focal * self.depths, inverse_focal - self.inverse_focal
         if nearer.min() < MIN_RELATIVE_DISTANCE:
             return UNLIKELY, np.zeros_like(flat)
         gram = constant + more * linear + more**2 * square
@@ -382,5 +382,5 @@ class CorrectedEnergy:
             return value, np.zeros_like(flat)
         slope = 0.5 * float(np.vdot(inverse, linear + 2 * more * square)) / frames
         slope += self.density_slope - 2 * float((self.depths / nearer).mean())
-        value += density(self.depths, curvature) + self.density + more * self.density_slope
+        value += density(self.depths, inverse_focal) + self.density + more * self.density_slope
         return value, np.append(gradient.flat(), slope)

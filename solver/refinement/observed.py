@@ -195,4 +195,4 @@ def _corrected(observed: Observed, found: Learned, before: Moments, start_scales
     depth = depth_map(found.rotations, found.scales * start_scales, found.covariance)
     depths = depth @ columns(complete)
     depths -= depths[:, observed.often].mean(axis=1, keepdims=True)
-    return corrected(observed.points + view.offsets[:, None], depths, view.curvature) - view.offsets[:, None]
+    return corrected(observed.points + view.offsets[:, None], depths, view.inverse_focal) - view.offsets[:, None]

@@ -67,7 +67,7 @@ def seen_in_perspective(
     camera = replace(solution.camera, principal_point=np.array(view.principal_point))
     if not view.is_perspective:
         return replace(solution, camera=camera)
-    focal = unit / abs(view.curvature)
+    focal = unit / abs(view.inverse_focal)
     scales, translations = camera.scales, camera.translations
     if kept is not None:
         nearer = 1 - camera.depths(solution.shapes)[:, kept].mean(axis=1) / focal

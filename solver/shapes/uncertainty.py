@@ -69,7 +69,7 @@ class Pinhole:
     depths: Floats
     """z, shape `(F, P)`, in the unit of the covariance."""
 
-    curvature: float
+    inverse_focal: float
     """κ = 1/φ, in the inverse unit of the covariance; positive."""
 
     @classmethod
@@ -83,8 +83,8 @@ class Pinhole:
 
     def derivatives(self, projections: Floats, point: int) -> Floats:
         """Return ∂v/∂x of a point in every frame, shape `(F, 2, 3)`."""
-        bent = projections - self.curvature * self.views[:, point, :, None] * self.depth_rows[:, None]
-        nearer = np.maximum(1 + self.curvature * self.depths[:, point], MIN_RELATIVE_DISTANCE)
+        bent = projections - self.inverse_focal * self.views[:, point, :, None] * self.depth_rows[:, None]
+        nearer = np.maximum(1 + self.inverse_focal * self.depths[:, point], MIN_RELATIVE_DISTANCE)
         return np.asarray(bent / nearer[:, None, None])
 
 

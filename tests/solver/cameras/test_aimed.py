@@ -16,27 +16,27 @@ from pliant.solver.refinement.learned import Learned, motion_of
 from pliant.solver.tracks.matrix import centred, columns
 
 FRAMES, POINTS = 5, 30
-CURVATURES = pytest.mark.parametrize("curvature", [0.25, -0.25])
+INVERSE_FOCALS = pytest.mark.parametrize("inverse_focal", [0.25, -0.25])
 PICTURE = (1280.0, 720.0)
 
 
-def scene(curvature: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points `(F, P, 3)` before a camera with κ = `curvature` at a depth of 1/κ, off the axis, and their images."""
+def scene(inverse_focal: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points `(F, P, 3)` before a camera with κ = `inverse_focal` at a depth of 1/κ, off the axis, and their images."""
     random = np.random.default_rng(3)
-    points = 0.6 * random.normal(size=(FRAMES, POINTS, 3)) + [0, 0, 1 / abs(curvature)]
+    points = 0.6 * random.normal(size=(FRAMES, POINTS, 3)) + [0, 0, 1 / abs(inverse_focal)]
     points[..., :2] += random.uniform(-1.5, 1.5, (FRAMES, 1, 2))
-    views = points[..., :2] / points[..., 2:] / abs(curvature)
-    return (points if curvature > 0 else points @ MIRROR), views  # negative κ: depth is minus the third coordinate
+    views = points[..., :2] / points[..., 2:] / abs(inverse_focal)
+    return (points if inverse_focal > 0 else points @ MIRROR), views  # negative κ: depth is minus the third coordinate
 
 
-@CURVATURES
-def test_turned_images_are_those_of_turned_pinhole_cameras(curvature: float) -> None:
-    points, views = scene(curvature)
-    aimed = Aimed.of(views, curvature)
+@INVERSE_FOCALS
+def test_turned_images_are_those_of_turned_pinhole_cameras(inverse_focal: float) -> None:
+    points, views = scene(inverse_focal)
+    aimed = Aimed.of(views, inverse_focal)
     seen = points @ aimed.turns.transpose(0, 2, 1)
-    images = seen[..., :2] / seen[..., 2:] / curvature
+    images = seen[..., :2] / seen[..., 2:] / inverse_focal
     np.testing.assert_allclose(aimed.views * aimed.turns[:, 2, 2, None, None], images, atol=1e-12)
-    middle = np.concatenate([curvature * views.mean(axis=1), np.ones((FRAMES, 1))], axis=1)
+    middle = np.concatenate([inverse_focal * views.mean(axis=1), np.ones((FRAMES, 1))], axis=1)
     turned = np.einsum("fij,fj->fi", aimed.turns, middle)
     np.testing.assert_allclose(turned[:, :2], 0, atol=1e-12)
     np.testing.assert_allclose(
@@ -54,17 +54,17 @@ def test_without_perspective_each_frame_is_centred() -> None:
     np.testing.assert_allclose(close.views, aimed.views, atol=1e-5)
 
 
-@CURVATURES
-def test_tracks_corrected_with_true_depths_are_scaled_orthographic(curvature: float) -> None:
+@INVERSE_FOCALS
+def test_tracks_corrected_with_true_depths_are_scaled_orthographic(inverse_focal: float) -> None:
     """With the object's origin at a depth of 1/κ along the original axis, the scale is 1 in the turned cameras, too."""
-    points, views = scene(curvature)
-    aimed = Aimed.of(views, curvature)
+    points, views = scene(inverse_focal)
+    aimed = Aimed.of(views, inverse_focal)
     seen = points @ aimed.turns.transpose(0, 2, 1)
     origin = np.einsum(
-        "fij,fj->fi", aimed.turns, np.concatenate([views.mean(axis=1), np.full((FRAMES, 1), 1 / curvature)], axis=1)
+        "fij,fj->fi", aimed.turns, np.concatenate([views.mean(axis=1), np.full((FRAMES, 1), 1 / inverse_focal)], axis=1)
     )
     depths = aimed.turns[:, 2, 2, None] * (seen[..., 2] - origin[:, None, 2])
-    straight = corrected(aimed.views, depths, curvature)
+    straight = corrected(aimed.views, depths, inverse_focal)
     np.testing.assert_allclose(straight, seen[..., :2], atol=1e-12)
 
 
@@ -124,13 +124,13 @@ def test_the_derivative_of_the_energy_with_known_rotations_is_exact() -> None:
     found = Learned(exponential(0.3 * random.normal(size=(FRAMES, 3))), np.ones(FRAMES), covariance, np.inf)
     energy = CorrectedEnergy(views, 0.2, found, turning=False)
     given = motion_of(energy.scene, found).flat()
-    for curvature in (0.17, 0.2):
-        more, step = curvature - 0.2, 1e-5
-        rows = columns(centred(corrected(views, energy.depths, curvature)))
+    for inverse_focal in (0.17, 0.2):
+        more, step = inverse_focal - 0.2, 1e-5
+        rows = columns(centred(corrected(views, energy.depths, inverse_focal)))
         gram = energy.grams[0] + more * energy.grams[1] + more**2 * energy.grams[2]
         np.testing.assert_allclose(gram, rows @ rows.T / POINTS, atol=1e-12)
-        _, gradient = energy(np.append(given, curvature))
-        below, above = (energy(np.append(given, curvature + each))[0] for each in (-step, step))
+        _, gradient = energy(np.append(given, inverse_focal))
+        below, above = (energy(np.append(given, inverse_focal + each))[0] for each in (-step, step))
         assert gradient[-1] == pytest.approx((above - below) / (2 * step), rel=1e-4, abs=1e-7)
 
 

@@ -87,7 +87,7 @@ def test_corrected_tracks_do_not_depend_on_the_size_of_chunks(chunk: int, monkey
     offsets = (normalized.centroid - CENTRE) / normalized.unit
     sample = normalized.points[:, ::3] + offsets[:, None]
     view = Perspective(
-        offsets, CENTRE, curvature=normalized.unit / FOCAL, learning_sample=sample, full_sample=sample,
+        offsets, CENTRE, inverse_focal=normalized.unit / FOCAL, learning_sample=sample, full_sample=sample,
         depth=depth_map(FACE.rotations, np.ones(len(SEEN)), covariance),
     )  # fmt: skip
     assert normalized.points.shape[1] < completion.POINTS_PER_CHUNK
@@ -98,7 +98,7 @@ def test_corrected_tracks_do_not_depend_on_the_size_of_chunks(chunk: int, monkey
     other, moved, _ = corrected_moments(view, normalized)
     assert other == pytest.approx(gram, abs=1e-12)
     assert moved == pytest.approx(middle, abs=1e-12)
-    assert depths[:, ::3] == pytest.approx(depths_of(view.depth, view.learning_sample, view.curvature), abs=1e-3)
+    assert depths[:, ::3] == pytest.approx(depths_of(view.depth, view.learning_sample, view.inverse_focal), abs=1e-3)
 
 
 @pytest.mark.parametrize("y_up", [False, True])
@@ -135,9 +135,9 @@ def test_corrected_tracks_equal_the_orthographic_tracks() -> None:
 
 
 def test_density_is_the_logarithm_of_the_jacobian() -> None:
-    depths, curvature = np.random.default_rng(1).normal(size=(4, 6)) * 0.5, 0.3
-    jacobian = np.array([np.linalg.det((1 + curvature * each) * np.eye(2)) for each in depths.ravel()])
-    assert density(depths, curvature) == pytest.approx(-np.log(jacobian).mean())
+    depths, inverse_focal = np.random.default_rng(1).normal(size=(4, 6)) * 0.5, 0.3
+    jacobian = np.array([np.linalg.det((1 + inverse_focal * each) * np.eye(2)) for each in depths.ravel()])
+    assert density(depths, inverse_focal) == pytest.approx(-np.log(jacobian).mean())
 
 
 def a_covariance(frames: int = 6) -> tuple[np.ndarray, ShapeCovariance]:
@@ -385,7 +385,7 @@ def test_shapes_centred_on_more_points_keep_their_image() -> None:
     flat = np.zeros(SEEN.shape[:2])
     given = Solution(about - whole[:, None], camera, flat, flat, None, None, None, {})  # type: ignore[arg-type]
     found = perspective_shapes.seen_in_perspective(
-        given, image, replace(view, curvature=normalized.unit / FOCAL), normalized.unit, kept
+        given, image, replace(view, inverse_focal=normalized.unit / FOCAL), normalized.unit, kept
     )
     assert found.residuals.max() < 1e-6
 
@@ -401,7 +401,7 @@ def test_other_priors_accept_fully_given_perspective_cameras(given: dict[str, ob
 def test_the_reported_gain_is_that_of_the_given_focal_length() -> None:
     candidates = tuple(Candidate(each, nll) for each, nll in ((0.0, 1.0), (0.1, 0.9), (0.2, 0.5), (-0.1, 0.95)))
     view = Perspective(
-        np.zeros((8, 2)), CENTRE, given=0.1, signs=(1, -1), required=False, curvature=0.1, candidates=candidates
+        np.zeros((8, 2)), CENTRE, given=0.1, signs=(1, -1), required=False, inverse_focal=0.1, candidates=candidates
     )
     assert "gains 0.100 in" in described(view, 100.0)
     assert "gains 0.400 in" in str(improbable(view, 100.0))
@@ -414,7 +414,7 @@ def test_the_reported_gain_is_that_of_the_given_focal_length() -> None:
         ({0.06: -0.01, -0.1: 0.0}, 0.06),
         ({0.06: -0.004}, None),  # clearly orthographic
         ({0.06: -0.031}, None),  # clearly perspective
-        ({0.01: -0.01, 0.06: 0.02}, None),  # a curvature that makes no difference
+        ({0.01: -0.01, 0.06: 0.02}, None),  # an inverse focal length that makes no difference
     ],
 )
 def test_gains_near_the_limit_leave_the_camera_model_unclear(nll: dict[float, float], unclear: float | None) -> None:
@@ -424,7 +424,7 @@ def test_gains_near_the_limit_leave_the_camera_model_unclear(nll: dict[float, fl
     assert (_unclear_camera(view, 100.0) is None) == (unclear is None)
     if unclear is not None:
         assert "a focal length of about 1667. " in str(_unclear_camera(view, 100.0))
-        found = str(_unclear_camera(replace(view, curvature=0.03), 100.0))  # after the joint refinement
+        found = str(_unclear_camera(replace(view, inverse_focal=0.03), 100.0))  # after the joint refinement
         assert "compare with camera=scaled_orthographic" in found
         assert "1667" not in found, "the focal length reported is another one"
     assert unclear_perspective(replace(view, required=True)) is None
@@ -434,7 +434,7 @@ def test_gains_near_the_limit_leave_the_camera_model_unclear(nll: dict[float, fl
 
 def test_an_unknown_picture_centre_is_a_warning_where_perspective_is_found() -> None:
     view = Perspective(
-        np.zeros((8, 2)), CENTRE, given=None, signs=(1, -1), required=False, curvature=0.1,
+        np.zeros((8, 2)), CENTRE, given=None, signs=(1, -1), required=False, inverse_focal=0.1,
         candidates=(Candidate(0.1, 0.5), Candidate(0.0, 1.0)),
     )  # fmt: skip
     orbit = FACE.rotations, np.ones(8)
@@ -453,13 +453,13 @@ def test_an_unknown_picture_centre_is_a_warning_where_perspective_is_found() -> 
         (Settings(), lens),
     ):
         assert warnings(settings, known) == ()
-    assert warnings(Settings(), found=replace(view, curvature=0.0)) == ()
+    assert warnings(Settings(), found=replace(view, inverse_focal=0.0)) == ()
 
 
 def test_a_given_focal_length_with_which_the_depths_diverge_has_no_figure_in_the_report() -> None:
     candidates = tuple(Candidate(each, nll) for each, nll in ((-0.1, UNLIKELY), (0.0, 1.0), (0.1, UNLIKELY)))
     view = Perspective(
-        np.zeros((8, 2)), CENTRE, given=0.1, signs=(1, -1), required=False, curvature=0.1, candidates=candidates
+        np.zeros((8, 2)), CENTRE, given=0.1, signs=(1, -1), required=False, inverse_focal=0.1, candidates=candidates
     )
     for sentence in (described(view, 100.0), str(improbable(view, 100.0))):
         assert "the depths of the points diverge" in sentence
@@ -468,5 +468,5 @@ def test_a_given_focal_length_with_which_the_depths_diverge_has_no_figure_in_the
 
 def test_the_standard_deviation_of_the_focal_length_is_said_to_count_noise_alone() -> None:
     candidates = (Candidate(0.0, -1.0), Candidate(0.1, -2.0))
-    view = Perspective(np.zeros((3, 2)), np.zeros(2), curvature=0.1, curvature_std=0.01, candidates=candidates)
+    view = Perspective(np.zeros((3, 2)), np.zeros(2), inverse_focal=0.1, inverse_focal_std=0.01, candidates=candidates)
     assert described(view, 100.0).endswith("is 1000 ± 100 from noise alone.")

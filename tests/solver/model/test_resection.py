@@ -38,15 +38,15 @@ def start() -> Poses:
     return Poses(still, np.ones(FRAMES), none, np.zeros((FRAMES, 2)), none, still, np.ones(FRAMES))
 
 
-@pytest.mark.parametrize("curvature", [0.0, 0.1])
+@pytest.mark.parametrize("inverse_focal", [0.0, 0.1])
 def test_poses_far_from_the_start_are_found_despite_outliers_and_hidden_points(
-    shapes: MeanShapes, truth: Poses, curvature: float
+    shapes: MeanShapes, truth: Poses, inverse_focal: float
 ) -> None:
-    _, image, nearer = predicted(shapes, truth, curvature)
+    _, image, nearer = predicted(shapes, truth, inverse_focal)
     points, weight = image / nearer[:, None], np.ones((FRAMES, POINTS))
     points[:, :, 3] += 2.0
     points[:, :, 5], weight[:, 5] = np.nan_to_num(np.inf, posinf=50.0), 0.0
-    found = resected(Views(points, weight, curvature), shapes, start(), turning=True, with_scales=True)
+    found = resected(Views(points, weight, inverse_focal), shapes, start(), turning=True, with_scales=True)
     assert np.degrees(angles_between(found.rotations, truth.rotations)).max() < 0.1
     assert found.scales == pytest.approx(truth.scales, rel=1e-3)
     assert found.coefficients == pytest.approx(truth.coefficients, abs=1e-2)

@@ -13,7 +13,7 @@ from pliant.solver.refinement.affine_iterations import affine_iterations
 from pliant.solver.refinement.depth_alternation import aligned
 from pliant.solver.refinement.learned import Learned, Refinement
 
-FRAMES, CURVATURE = 24, 0.16
+FRAMES, INVERSE_FOCAL = 24, 0.16
 ANY = (Candidate(0.0, np.inf),)
 
 
@@ -33,7 +33,7 @@ def hinge() -> tuple[Floats, Perspective]:
     rotations = exponential(np.linspace(0, 1.6, FRAMES)[:, None] * np.array([0.25, 1.0, 0.1]))
     seen = shapes @ rotations.transpose(0, 2, 1)
     seen /= np.sqrt(np.square(seen[..., :2]).sum(axis=2).mean())
-    views = seen[..., :2] / (1 + CURVATURE * seen[..., 2:])
+    views = seen[..., :2] / (1 + INVERSE_FOCAL * seen[..., 2:])
     return rotations, Perspective(np.zeros((FRAMES, 2)), np.zeros(2), learning_sample=views, candidates=ANY)
 
 
@@ -57,13 +57,13 @@ def unknown(hinge: tuple[Floats, Perspective]) -> tuple[Learned, float]:
     return found_from(hinge, 15.0)
 
 
-@pytest.mark.parametrize("given", [None, CURVATURE])
+@pytest.mark.parametrize("given", [None, INVERSE_FOCAL])
 def test_cameras_and_sign_of_depth_follow_from_the_tracks(
     hinge: tuple[Floats, Perspective], unknown: tuple[Learned, float], given: float | None
 ) -> None:
     rotations, _ = hinge
-    learned, curvature = unknown if given is None else found_from(hinge, 15.0, given)
-    assert curvature == given if given is not None else 0.5 < curvature / CURVATURE < 2
+    learned, inverse_focal = unknown if given is None else found_from(hinge, 15.0, given)
+    assert inverse_focal == given if given is not None else 0.5 < inverse_focal / INVERSE_FOCAL < 2
     every = np.arange(FRAMES)
     assert np.degrees(angles_between(aligned(learned.rotations, rotations, every), rotations)).mean() < 6
     assert learned.scales == pytest.approx(1)
@@ -81,7 +81,7 @@ def test_the_result_hardly_depends_on_the_other_cameras(
 
 def test_a_more_probable_search_is_kept(hinge: tuple[Floats, Perspective]) -> None:
     rotations, view = hinge
-    better = replace(view, curvature=0.1, candidates=(Candidate(0.1, -np.inf),))
+    better = replace(view, inverse_focal=0.1, candidates=(Candidate(0.1, -np.inf),))
     assert affine_iterations(view.learning_sample, rotations, np.ones(FRAMES), better, Refinement()) is None
 
 

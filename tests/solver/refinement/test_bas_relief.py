@@ -165,17 +165,17 @@ def test_perspective_is_the_same_at_twice_the_depth_and_twice_the_focal_length(m
     deep = estimate_cameras(tracks, settings=settings).estimate
     assert deep.perspective is not None
     assert deep.depth_is_typical
-    assert deep.perspective.curvature_std > LOG_DEPTH_STD * abs(deep.perspective.curvature)
+    assert deep.perspective.inverse_focal_std > LOG_DEPTH_STD * abs(deep.perspective.inverse_focal)
     assert "focal length" in deep.reasons["depth_extent"]
 
-    strong = replace(deep, perspective=replace(deep.perspective, curvature=0.04))
+    strong = replace(deep, perspective=replace(deep.perspective, inverse_focal=0.04))
     (given,) = before
     evidence = Evidence.of(strong, normalize(tracks), np.arange(12), np.ones(12))
     plain = with_stretched_depth(evidence, given, 1.0).estimate
     moved, _ = settled(plain.gram, given)
     twice = with_stretched_depth(evidence, moved, 2.0).estimate
     assert twice.perspective is not None
-    assert twice.perspective.curvature == 0.02
+    assert twice.perspective.inverse_focal == 0.02
     view = deep.perspective.learning_sample
     bent = (plain.sample - view + view.mean(axis=1, keepdims=True)).std()
     assert bent > 0.005

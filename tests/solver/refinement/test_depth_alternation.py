@@ -38,7 +38,7 @@ def rigid() -> tuple[np.ndarray, Perspective, np.ndarray]:
     rotations = exponential(np.linspace(0, 1.4, 12)[:, None] * np.array([0.2, 1.0, 0.1]))
     seen = (cloud - cloud.mean(axis=0)) @ rotations.transpose(0, 2, 1) / 1.5
     view = Perspective(
-        np.zeros((12, 2)), np.zeros(2), curvature=0.25, learning_sample=seen[..., :2] / (1 + 0.25 * seen[..., 2:])
+        np.zeros((12, 2)), np.zeros(2), inverse_focal=0.25, learning_sample=seen[..., :2] / (1 + 0.25 * seen[..., 2:])
     )
     flat = columns(centred(seen[..., :2]))
     return rotations, view, flat @ flat.T / 40

@@ -16,7 +16,7 @@ from pliant.solver.refinement.focal_length import _Comparison, search
 from pliant.solver.refinement.learned import Learned, Refinement, to_all_frames
 from pliant.solver.tracks.frame_selection import evenly_spread
 
-CURVATURE = 0.18
+INVERSE_FOCAL = 0.18
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ def seen_face(frames: int, points: int, *, noise: float, seed: int = 2) -> Seen:
     face = gallery.face(frames, points, degrees=30, seed=seed)
     seen = (face.shapes - face.shapes.mean(axis=1, keepdims=True)) @ face.rotations.transpose(0, 2, 1)
     seen /= np.sqrt(np.square(seen[..., :2]).sum(axis=-1).mean())
-    views = seen[..., :2] / (1 + CURVATURE * seen[..., 2:])
+    views = seen[..., :2] / (1 + INVERSE_FOCAL * seen[..., 2:])
     middle = face.rotations[frames // 2]
     start = exponential(0.8 * logarithm(face.rotations @ middle.T)) @ middle
     return Seen(views + noise * np.random.default_rng(seed).normal(size=views.shape), face.rotations, start)
@@ -50,7 +50,7 @@ def view_of(frames: int) -> Perspective:
 def test_noise_and_cameras_that_turn_too_little_do_not_hide_perspective() -> None:
     face = seen_face(32, 300, noise=0.01)
     view, found = search(face.views, face.start, np.ones(32), view_of(32), Refinement(ModelOrder(noisy_start=True)))
-    assert view.curvature == pytest.approx(CURVATURE, rel=0.1)
+    assert view.inverse_focal == pytest.approx(INVERSE_FOCAL, rel=0.1)
     assert view.sign_known
     assert face.off(found.rotations) < 0.5 * face.off(face.start)
     nll = [each.nll for each in view.candidates]
@@ -62,7 +62,7 @@ def test_noise_and_cameras_that_turn_too_little_do_not_hide_perspective() -> Non
 def test_given_rotations_are_kept() -> None:
     face = seen_face(8, 40, noise=0.0)
     view, found = search(face.views, face.rotations, np.ones(8), view_of(8), Refinement(turning=False))
-    assert view.curvature > 0
+    assert view.inverse_focal > 0
     assert found.rotations == pytest.approx(face.rotations, abs=1e-12)
 
 
@@ -71,13 +71,13 @@ def test_levelling_only_raises_likelihoods_and_reaches_orthography() -> None:
     comparison = _Comparison.of(face.views, face.start, np.ones(8), Refinement())
     comparison.add(0.1)
     comparison.add(-0.1)
-    before = {curvature: trial.nll for curvature, trial in comparison.trials.items()}
+    before = {inverse_focal: trial.nll for inverse_focal, trial in comparison.trials.items()}
     comparison.level()
-    after = {curvature: trial.nll for curvature, trial in comparison.trials.items()}
-    assert all(after[curvature] <= before[curvature] for curvature in before)
+    after = {inverse_focal: trial.nll for inverse_focal, trial in comparison.trials.items()}
+    assert all(after[inverse_focal] <= before[inverse_focal] for inverse_focal in before)
     assert after[0.0] < before[0.0]
     replace(comparison, how=Refinement(should_stop=lambda: True)).level()
-    assert {curvature: trial.nll for curvature, trial in comparison.trials.items()} == after
+    assert {inverse_focal: trial.nll for inverse_focal, trial in comparison.trials.items()} == after
 
 
 def test_a_focal_length_at_which_the_depths_diverge_is_unlikely() -> None:

@@ -77,11 +77,11 @@ def test_perspective_is_corrected_with_the_depths_of_the_expected_tracks() -> No
     observed, _, completed = begun(tracks)
     start = KEPT.learn(completed.gram, np.asarray(KNOWN.rotations), ONES)
     _, flat = on_observations(observed, start, completed, ONES, KEPT)
-    unit, curvature = normalize(tracks).unit, 0.1
+    unit, inverse_focal = normalize(tracks).unit, 0.1
     depths = np.einsum("fj,fpj->fp", MADE.rotations[:, 2], MADE.shapes) / unit
     depths -= depths.mean(axis=1, keepdims=True)
-    bent = np.asarray(corrected(observed.points, np.zeros_like(depths), 0.0)) / (1 + curvature * depths)[..., None]
-    view = Perspective(np.zeros((20, 2)), np.zeros(2), curvature=curvature)
+    bent = np.asarray(corrected(observed.points, np.zeros_like(depths), 0.0)) / (1 + inverse_focal * depths)[..., None]
+    view = Perspective(np.zeros((20, 2)), np.zeros(2), inverse_focal=inverse_focal)
     pinhole = replace(observed, points=bent, view=view)
     _, moments = on_observations(pinhole, start, completed, ONES, KEPT)
     uncorrected = replace(pinhole, view=None)
