@@ -26,7 +26,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from pliant.solver import Mesh, Settings, Tracks, solve
+from pliant.solver import Mesh, Settings, Solution, Tracks, solve
 from pliant.solver.evaluation.metrics import e3d_frame_scaled
 from pliant.solver.gallery import Sequence, face, flag, sphere
 from pliant.tracking import TrackedFilm, open_film, track_film
@@ -89,9 +89,19 @@ def _shapes(film: RenderedFilm, tracked: TrackedFilm, truth: Truth, points: int)
     found = _solved(tracked.tracks[:, kept], visible, mesh, film.size)
     ideal = _solved(exact, seen, mesh, film.size)
     return {
-        "points": len(kept), "e3d_frame_scaled": truth.shape_error(found, kept),
-        "e3d_frame_scaled_exact_tracks": truth.shape_error(ideal, kept),
+        "points": len(kept), "e3d_frame_scaled": truth.shape_error(found.shapes, kept),
+        "e3d_frame_scaled_exact_tracks": truth.shape_error(ideal.shapes, kept),
+        **_focal(found, film, ""), **_focal(ideal, film, "_exact_tracks"),
     }  # fmt: skip
+
+
+def _focal(solution: Solution, film: RenderedFilm, suffix: str) -> dict[str, float]:
+    """Return the estimated focal length and its standard deviation, relative to the true one; nothing under orthography."""
+    camera = solution.camera
+    if camera.focal is None:
+        return {}
+    deviation = {} if camera.focal_std is None else {f"focal_std{suffix}": camera.focal_std / film.focal}
+    return {f"focal_ratio{suffix}": camera.focal / film.focal, **deviation}
 
 
 def _thinned(tracked: TrackedFilm, points: int, truth: Truth) -> tuple[Mesh, np.ndarray]:
@@ -105,9 +115,9 @@ def _thinned(tracked: TrackedFilm, points: int, truth: Truth) -> tuple[Mesh, np.
     return Mesh.from_grid(np.where(coarse >= 0, np.searchsorted(kept, coarse), -1)), kept
 
 
-def _solved(tracks: np.ndarray, visible: np.ndarray, mesh: Mesh, size: tuple[int, int]) -> np.ndarray:
+def _solved(tracks: np.ndarray, visible: np.ndarray, mesh: Mesh, size: tuple[int, int]) -> Solution:
     settings = Settings(image_size=(float(size[0]), float(size[1])))
-    return solve(Tracks.from_arrays(tracks.astype(float), visible.astype(float)), mesh, settings=settings).shapes
+    return solve(Tracks.from_arrays(tracks.astype(float), visible.astype(float)), mesh, settings=settings)
 
 
 def recorded(given: argparse.Namespace) -> None:
@@ -131,7 +141,7 @@ def recorded(given: argparse.Namespace) -> None:
     if not given.tracks_only:
         visible = np.where(tracked.visibility, tracked.confidence, 0)
         began = time.perf_counter()
-        solved = _solved(tracked.tracks, visible, Mesh.from_grid(tracked.grid), tracked.image_size)
+        solved = _solved(tracked.tracks, visible, Mesh.from_grid(tracked.grid), tracked.image_size).shapes
         at = _carried(here, solved[rows], pixels[first])
         on = np.isfinite(at).all(axis=(0, 2))
         row["solve_seconds"] = time.perf_counter() - began
