@@ -15,7 +15,7 @@ import pytest
 from browsing import Browsing
 from filming import KEEP_SENT, film_record, films_in, with_film_options
 from long_jobs import long_request
-from paging import QUICK, TRACKS, packed
+from paging import PAUSES, QUICK, TRACKS, packed
 from playwright.sync_api import Browser, Page, ViewportSize
 from pliant.client import Client
 from pliant.solver.gallery import corrupt, flag
@@ -102,6 +102,7 @@ def window(browser: Browser) -> Iterator[Window]:
     context.add_init_script(
         "addEventListener('securitypolicyviolation', (event) => console.error('CSP blocked ' + event.blockedURI));"
     )
+    context.add_init_script(PAUSES)
     window = Window(context.new_page(), [])
     window.page.on("pageerror", lambda error: window.troubles.append(str(error)))
     window.page.on("console", lambda message: window.troubles.append(message.text) if "CSP" in message.text else None)
