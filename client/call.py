@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import version
 from typing import Any
 
@@ -67,6 +68,12 @@ def base_of(url: str) -> str:
     return url.rstrip("/")
 
 
+@cache
+def user_agent() -> str:
+    """Return the client's name and version, which is read from files once."""
+    return f"pliant-client/{version('pliant')}"
+
+
 def headers_of(token: str | None, more: Mapping[str, str] | None) -> dict[str, str]:
     """Return the headers of every request; the caller's own take precedence.
 
@@ -75,7 +82,7 @@ def headers_of(token: str | None, more: Mapping[str, str] | None) -> dict[str, s
     BadArgument
         The token is not a text, or has characters that no token has; the message does not show it.
     """
-    headers = {"User-Agent": f"pliant-client/{version('pliant')}"}
+    headers = {"User-Agent": user_agent()}
     if token is not None and not isinstance(token, str):
         raise BadArgument(f"token: expected a str, got a value of type {type(token).__name__}.")
     token = "" if token is None else token.strip()
@@ -116,7 +123,7 @@ def redirected(location: str, call: Call, timeout: float) -> httpx.Request:
     from the service's, which has already evaluated it.
     """
     names = ("Accept-Encoding", "Range")
-    headers = {"User-Agent": f"pliant-client/{version('pliant')}"}
+    headers = {"User-Agent": user_agent()}
     headers |= {name: call.headers[name] for name in names if name in call.headers}
     limits = _limits(timeout).as_dict() | {"connect": min(REDIRECT_TIMEOUT, timeout)}
     return httpx.Request("GET", location, headers=headers, extensions={"timeout": limits})

@@ -15,7 +15,7 @@ import pytest
 from pliant.cli import app
 from pliant.cli.exits import Exit, code_of
 from pliant.cli.session import Session
-from pliant.client import Problem
+from pliant.client import Client, Problem
 from pliant.service.testing import InMemoryService
 from typer.testing import CliRunner, Result
 
@@ -248,11 +248,18 @@ def test_a_failed_job_ends_with_exit_code_1_and_its_message(tracks: Path) -> Non
     assert json.loads(ran.stderr)["exit_code"] == 1
 
 
+class Impatient(Session):
+    """Gives up on a service that never answered after a fraction of the usual five seconds."""
+
+    def client(self, url: str, *, as_json: bool, first_contact: float | None = None) -> Client:
+        return super().client(url, as_json=as_json, first_contact=0.3)
+
+
 def test_timeouts_and_unreachable_services_have_exit_codes(tracks: Path) -> None:
     endless = Session(transport=InMemoryService(steps=math.inf))
     ran = CliRunner().invoke(app, ["submit", str(tracks), "--wait", "--timeout", "0.3"], obj=endless)
     assert ran.exit_code == Exit.TIMEOUT
-    ran = CliRunner().invoke(app, ["list", "--url", "http://127.0.0.1:9", "--json"])
+    ran = CliRunner().invoke(app, ["list", "--url", "http://127.0.0.1:9", "--json"], obj=Impatient())
     assert ran.exit_code == Exit.UNREACHABLE
     assert "pliant up" in json.loads(ran.stderr)["detail"]
 

@@ -6,20 +6,24 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import httpx
 import pytest
 from browsing import Browsing
 from filming import KEEP_SENT, film_record, films_in, with_film_options
 from long_jobs import long_request
-from paging import QUICK, TRACKS, packed
+from paging import PAUSES, QUICK, TRACKS, packed
 from playwright.sync_api import Browser, Page, ViewportSize
 from pliant.client import Client
 from pliant.solver.gallery import corrupt, flag
 
 WHOLE: ViewportSize = {"width": 1280, "height": 900}
+BLANK = "/blank"
+"""A path that the browser answers itself. An address of the service keeps the process that has drawn the page, which draws it again in
+two thirds of the time; about:blank ends it."""
 
 
 @pytest.fixture(scope="session")
@@ -53,10 +57,34 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
             up.wait(30)
 
 
-@pytest.fixture(scope="module")  # not longer: while Playwright runs, no other test may run an event loop
-def browser() -> Iterator[Browser]:
-    with Browsing() as browsing:
-        yield browsing
+OPEN: list[tuple[Browsing, Browser]] = []
+"""The browser that consecutive modules share: starting one takes as long as a short test of the page."""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Browser:
+    if OPEN and not OPEN[0][1].is_connected():
+        close_browser()
+    if not OPEN:
+        browsing = Browsing()
+        OPEN.append((browsing, browsing.__enter__()))
+    return OPEN[0][1]
+
+
+def close_browser() -> None:
+    while OPEN:
+        OPEN.pop()[0].__exit__(None, None, None)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(nextitem: pytest.Item | None) -> Generator[None, object, object]:
+    """Close the browser before a test that needs none: while Playwright runs, no other test may run an event loop."""
+    try:
+        return (yield)
+    finally:
+        here = nextitem is not None and Path(__file__).parent in nextitem.path.parents
+        if not here or nextitem.get_closest_marker("chromium") is None:
+            close_browser()
 
 
 @dataclass
@@ -74,6 +102,7 @@ def window(browser: Browser) -> Iterator[Window]:
     context.add_init_script(
         "addEventListener('securitypolicyviolation', (event) => console.error('CSP blocked ' + event.blockedURI));"
     )
+    context.add_init_script(PAUSES)
     window = Window(context.new_page(), [])
     window.page.on("pageerror", lambda error: window.troubles.append(str(error)))
     window.page.on("console", lambda message: window.troubles.append(message.text) if "CSP" in message.text else None)
@@ -90,7 +119,11 @@ def page(window: Window, url: str) -> Iterator[Page]:
     page.unroute_all(behavior="ignoreErrors")  # a request may be in flight when the test ends
     if page.url.startswith(url):
         page.evaluate("sessionStorage.clear()")
-    page.goto("about:blank")
+        page.route(url + BLANK, lambda route: route.fulfill(body="", content_type="text/html"))
+        page.goto(url + BLANK)
+        page.unroute_all()
+    else:
+        page.goto("about:blank")
     page.set_viewport_size(WHOLE)
     page.emulate_media(color_scheme="light", reduced_motion="reduce")
     for job in httpx.get(f"{url}/v1/jobs?status=queued&status=running&limit=100").json()["jobs"]:

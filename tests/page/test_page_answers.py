@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 import pytest
 from browsing import heard, why_not
-from paging import TRACKS, choose, until
+from paging import TRACKS, choose, refresh, until
 from playwright.sync_api import Page, Route, expect
 
 pytestmark = [
@@ -74,18 +74,24 @@ def test_the_token_form_appears_after_other_errors_and_keeps_a_half_typed_token(
     expect(page.locator(".jobs li")).to_have_count(1)
     alert, token = page.locator("#trouble").get_by_role("alert"), page.get_by_label("Token")
     now = "unreadable"
+    refresh(page)
     expect(alert).to_contain_text("cannot be read")
     now = "locked"
+    refresh(page)
     expect(alert).to_contain_text("needs a token")
     alert.evaluate("(it) => (it.dataset.seen = 'yes')")
     token.fill("half")
     before = len(sent)
+    for _ in range(2):
+        refresh(page)
     heard(page, lambda: len(sent) > before + 1)
     expect(alert).to_have_attribute("data-seen", "yes")  # announced once
     now = "rejected"
+    refresh(page)
     expect(alert).to_contain_text("invalid_token")
     expect(alert).not_to_contain_text("Authorization")
     now = "busy"
+    refresh(page)
     expect(alert).to_contain_text("queue_unavailable")
     expect(token).to_have_value("half")
     expect(token).to_be_focused()
@@ -98,6 +104,7 @@ def test_the_token_form_appears_after_other_errors_and_keeps_a_half_typed_token(
     heard(page, lambda: sent[-1] is None)
     assert "Bearer half" in sent
     now = "fine"
+    refresh(page)
     expect(token).to_have_count(0)
     expect(alert).to_have_count(0)
 
@@ -113,6 +120,8 @@ def test_a_job_in_the_list_is_followed_again_after_a_refusal(page: Page, url: st
     page.route(LIST, lambda route: route.fulfill(json={"jobs": [running], "next": None}))
     page.route(f"**/v1/jobs/{finished}", answer)
     page.goto(url)
+    heard(page, lambda: len(asked) > 0)
+    refresh(page)
     heard(page, lambda: len(asked) > 1)
 
 

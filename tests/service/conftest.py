@@ -61,8 +61,9 @@ def serve(valkey_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator
         return Running(f"http://127.0.0.1:{port}", jobs, settings, server, tokens, app)
 
     yield start
-    for server, thread in started:
+    for server, _ in started:
         server.should_exit = True
+    for _, thread in started:
         thread.join(10)
 
 

@@ -19,6 +19,18 @@ DONE = 180_000
 QUICK = json.dumps({"camera": "orthographic", "surface": "free"})
 """Options of a job whose result is only shown; with its cameras given, it takes a tenth of the default's time."""
 
+PAUSES = """{
+  const [set, pauses] = [window.setTimeout, new Map()];
+  window.setTimeout = (then, after, ...given) => {
+    const end = () => (pauses.delete(timer), then(...given));
+    const timer = set(end, after);
+    if (after === 2000 || after === 8000) pauses.set(timer, end);
+    return timer;
+  };
+  window.endPauses = () => [...pauses].map(([timer, end]) => (clearTimeout(timer), end())).length;
+}"""
+"""A script that lets tests end the pauses between refreshes of the list of jobs."""
+
 BOTH_WIDTHS_AND_THEMES = [
     (1280, "light"),
     (390, "dark"),
@@ -65,6 +77,11 @@ def until(holds: Callable[[], bool], seconds: float = 30) -> None:
     while not holds():
         assert time.monotonic() < end, "it did not happen in time"
         time.sleep(0.05)
+
+
+def refresh(page: Page) -> None:
+    """Let the list of jobs be refreshed now instead of after its pause of two seconds, or of eight if no job is unfinished."""
+    until(lambda: page.evaluate("endPauses()") > 0)
 
 
 def steps_of(chart: Locator) -> int:

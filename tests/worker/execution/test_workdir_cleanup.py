@@ -20,6 +20,23 @@ from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 
 
+class Clock:
+    """Pauses that take no time."""
+
+    now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pliant.worker.execution.monitor.time", Clock())
+
+
 def test_all_retried_calls_share_one_time_limit() -> None:
     asked: list[str] = []
 
