@@ -6,9 +6,9 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from pliant.service import openapi, problems
-from pliant.service.dependencies import Service
+from pliant.service.dependencies import Service, known_parameters
 from pliant.service.event_stream import Followers
 from pliant.service.metrics import CountRequests, Metrics
 from pliant.service.middleware.access_log import HEADER as REQUEST_ID_HEADER
@@ -65,7 +65,8 @@ def create_app(
     )
     routes = [route for each in ROUTES for route in each.router.routes]
     problems.install(app, routes=routes, security_headers=SECURITY_HEADERS)
-    app.router.routes.extend(routes)  # `include_router` would analyse every route a second time, at the first request
+    for each in ROUTES:
+        app.include_router(each.router, dependencies=[Depends(known_parameters)])
     mount_page(app)
     app.openapi = lambda: openapi.document(app)  # type: ignore[method-assign]
     return app

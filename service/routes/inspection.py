@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from fastapi import Request
+from fastapi import APIRouter, Request
 from numpy.typing import NDArray
 from pliant.schemas.job import Inspection
 from pliant.schemas.problems import ProblemCode
@@ -13,14 +13,13 @@ from pliant.service.dependencies import Bound, Core, MyUploads, Service
 from pliant.service.multipart import Form, receive_form
 from pliant.service.openapi import SUBMIT_BODY, problems
 from pliant.service.problems import wrong_input
-from pliant.service.routes.router import StrictRouter
 from pliant.service.submission import KEPT, form_rules, parse_options, read_form, with_uploads
 from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.formats import Inputs, load_inputs
 from pliant.worker.formats.isolated_reader import LARGE
 from pliant.worker.uploads.service import Uploads
 
-router = StrictRouter(prefix="/v1/inspect", tags=["jobs"])
+router = APIRouter(prefix="/v1/inspect", tags=["jobs"])
 
 SAMPLE_FRAMES, SAMPLE_POINTS = 16, 200
 """Maximum numbers of frames and points in a sample."""

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from anyio import to_thread
-from fastapi import Request, Response
+from fastapi import APIRouter, Request, Response
 from pliant.schemas.job import Job
 from pliant.schemas.outputs import OutputRequest
 from pliant.service.dependencies import Mine
 from pliant.service.openapi import problems
 from pliant.service.routes.jobs import Id, Key
 from pliant.service.routes.json_body import body_of, read_json
-from pliant.service.routes.router import StrictRouter
 from pliant.worker.jobs.further_outputs import make_outputs
 
-router = StrictRouter(prefix="/v1/jobs/{id}/outputs", tags=["jobs"])
+router = APIRouter(prefix="/v1/jobs/{id}/outputs", tags=["jobs"])
 
 _LOCATION = {"Location": {"description": "The new job's address.", "schema": {"type": "string"}}}
 

@@ -1,22 +1,14 @@
-"""The routers of the API's routes."""
+"""The router of the API's routes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
-from fastapi import APIRouter, Depends
-from pliant.service.dependencies import known_parameters
+from fastapi import APIRouter
 
 
-class StrictRouter(APIRouter):
-    """A router whose routes refuse query parameters that they do not have."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(dependencies=[Depends(known_parameters)], **settings)
-
-
-class Router(StrictRouter):
+class Router(APIRouter):
     """A router whose GET routes also answer HEAD, with the same status and headers (RFC 9110); the server omits the body."""
 
     def add_api_route(

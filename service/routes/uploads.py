@@ -18,19 +18,18 @@ from typing import Annotated, Literal
 
 import anyio
 from anyio import to_thread
-from fastapi import Header, Path, Request, Response
+from fastapi import APIRouter, Header, Path, Request, Response
 from pliant.schemas.job import Upload
 from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Bound, Bounds, Core, MyUploads, Service, bounds_of
 from pliant.service.multipart import batches
 from pliant.service.openapi import problems
 from pliant.service.problems import Refusal, refused, wrong_input
-from pliant.service.routes.router import StrictRouter
 from pliant.worker.errors import OffsetMismatch
 from pliant.worker.uploads.service import Uploads
 from pliant.worker.uploads.writer import Capacity, Writer
 
-router = StrictRouter(prefix="/v1/uploads", tags=["uploads"])  # not `Router`: HEAD has an answer of its own
+router = APIRouter(prefix="/v1/uploads", tags=["uploads"])  # not `Router`: HEAD has an answer of its own
 
 ANY = 2**62
 MISMATCH = "https://iana.org/assignments/http-problem-types#mismatching-upload-offset"
