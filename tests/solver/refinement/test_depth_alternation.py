@@ -33,7 +33,7 @@ def test_aligned_cameras_adopt_the_world_axes_and_depth_sign_of_others(mirrored:
 @pytest.fixture(scope="module")
 def rigid() -> tuple[np.ndarray, Perspective, np.ndarray]:
     """Rotations, views in perspective at κ = .25, and the Gram matrix of the exactly corrected tracks of a rigid cloud."""
-    random = np.random.default_rng(1)
+    random = np.random.default_rng(2)
     cloud = random.normal(size=(40, 3))
     rotations = exponential(np.linspace(0, 1.4, 12)[:, None] * np.array([0.2, 1.0, 0.1]))
     seen = (cloud - cloud.mean(axis=0)) @ rotations.transpose(0, 2, 1) / 1.5
