@@ -14,7 +14,7 @@ PAGE_SOURCES := $(wildcard service/web/*.json service/web/*.mjs service/web/src/
 
 help:
 	@echo "make demo    reconstruct a moving face end to end: service, queue, worker, glTF"
-	@echo "make test    run the tests: four to six minutes on two cores, nothing but Python needed"
+	@echo "make test    run the tests: two to five minutes on two cores, nothing but Python needed"
 	@echo "make test-slow  run what is slow or needs Chromium, Node.js, an S3 server or root"
 	@echo "make test-long  run long forms of what the other tests cover"
 	@echo "make matrix  make test with every Python from 3.11 to 3.14 on this machine"
