@@ -64,7 +64,7 @@ class SurfaceGraph:
         """Weight of the length of every pair: the harmonic mean of the confidences of its ends, whose variances add."""
         frame, edge = self.pairs
         first, second = (self.confidence[frame, self.edges[edge, end]] for end in (0, 1))
-        return np.asarray(2 / (1 / first + 1 / second))
+        return np.asarray(2 * first * second / (first + second))
 
 
 def maximum_depth(graph: SurfaceGraph, *, should_stop: ShouldStop = never) -> Floats | None:

@@ -26,7 +26,8 @@ def test_priority_overtakes_only_jobs_of_the_same_owner(jobs: Jobs, submit) -> N
     assert names(jobs) == ["a4-high", "b1", "a1", "b2", "a3", "a2-low"]
     submit(ada, name="a5-high", priority="high")
     assert names(jobs) == ["a4-high", "b1", "a5-high", "b2", "a1", "a3", "a2-low"]
-    assert jobs.get(jobs.page(limit=1).jobs[0].id).priority == "high"
+    listed = {each.name: each.priority for each in (jobs.get(found.id) for found in jobs.page(limit=10).jobs)}
+    assert (listed["a1"], listed["a2-low"], listed["a4-high"], listed["a5-high"]) == ("normal", "low", "high", "high")
 
 
 def test_a_retried_job_keeps_its_priority(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
