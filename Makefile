@@ -77,14 +77,14 @@ PYTHON_TESTS := env PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 OPENBLAS_NUM_THRE
 PYTEST := $(PYTHON_TESTS) $(SHARED)
 NEEDY := slow or chromium or node or s3 or root
 
-# Services and pages wait for a third of their time: they get one process more, and what only computes fills the rest at low priority.
+# Services and pages wait for a third of their time. What only computes fills it, in as many processes of low priority.
 COMPUTING := tests/solver tests/tracking tests/benchmarks
 ASIDE := build/computing.log
 define ALL_TESTS
 @mkdir -p build
 @nice -n 10 $(PYTEST) --timeout=900 -p no:cacheprovider -m "$(1)" $(COMPUTING) >$(ASIDE) 2>&1 & computing=$$!; \
 trap 'kill $$computing' INT TERM; \
-$(PYTHON_TESTS) -n $$(( $(PROCESSES) + 1 )) --dist loadfile -m "$(1)" $(COMPUTING:%=--ignore=%); failed=$$?; \
+$(PYTEST) -m "$(1)" $(COMPUTING:%=--ignore=%); failed=$$?; \
 wait $$computing || failed=$$?; cat $(ASIDE); exit $$failed
 endef
 RUN_TESTS = $(if $(TESTS)$(filter 1,$(PROCESSES)),$(PYTEST) -m "$(1)" $(TESTS),$(ALL_TESTS))
