@@ -71,6 +71,25 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.freeze()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def closed_connections() -> Iterator[None]:
+    """Close the connections to Redis that a module has opened: otherwise they are collected, perhaps a socket before its connection."""
+    import redis
+
+    pools: list[redis.ConnectionPool] = []
+
+    class Kept(redis.ConnectionPool):
+        def __init__(self, *given: Any, **settings: Any) -> None:
+            super().__init__(*given, **settings)
+            pools.append(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("redis.client.ConnectionPool", Kept)
+        yield
+    for pool in pools:
+        pool.disconnect(inuse_connections=False)  # others may still be used by fixtures of the session
+
+
 @pytest.fixture(scope="session")
 def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address of a running service; its jobs compute with one thread, so that their arrays can be compared bit for bit."""

@@ -76,9 +76,8 @@ class Delivery(RqJob):
             work.run(arguments[0], arguments[1], settings=self.settings, worker=str(self.worker_name))
         except StoreUnavailable as error:
             logger.warning("job %s: the outcome is not recorded: %s", arguments[0], error)
-            os._exit(
-                UNRECORDED
-            )  # RQ would end with the code of any error, and the worker could not tell an outage from a crash
+            # RQ would end with the code of any error, and the worker could not tell an outage from a crash.
+            os._exit(UNRECORDED)
 
     @property
     def success_callback(self) -> None:
