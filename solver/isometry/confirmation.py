@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from pliant.solver.isometry.focal_sweep import FocalSearch, Tried
 from pliant.solver.isometry.inextensible import maximum_depth
-from pliant.solver.isometry.refinement import refine
+from pliant.solver.isometry.restarts import refine_with_restarts
 from pliant.solver.model.so3 import nearest
 from pliant.solver.records import Floats
 
@@ -41,7 +41,9 @@ def disagreement(search: FocalSearch, chosen: Tried) -> float:
         depths = maximum_depth(graph, should_stop=search.should_stop) if len(half) >= 2 else None
         if depths is None:
             return np.inf
-        found.append(unlike(refine(graph, depths, should_stop=search.should_stop).lengths, chosen.found.lengths))
+        found.append(
+            unlike(refine_with_restarts(graph, depths, should_stop=search.should_stop).lengths, chosen.found.lengths)
+        )
     return max(found)
 
 

@@ -1,9 +1,8 @@
 """Extension from anchors to all points, by a flat template of the surface and thin-plate splines over it.
 
 The template flattens the graph of edge lengths (Isomap: shortest paths, then classical scaling; Tenenbaum, de Silva and Langford 2000).
-In every frame, a spline maps the visible points from the image to the template; the median over frames is a point's template position,
-which is robust to outliers. A second spline per frame maps all points, including hidden ones, from the template to space. The image of a
-visible point is the mean of its track and the spline's image, weighted by their inverse variances.
+Splines through the anchors map the template to space (`isometry.placement`), in every frame and for all points, including hidden ones. The
+image of a visible point is the mean of its track and the spline's image, weighted by their inverse variances.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.inextensible import Indices
+from pliant.solver.isometry.placement import TemplateMap, places_of, spline
 from pliant.solver.model.so3 import nearest
 from pliant.solver.records import Floats
 from pliant.solver.tracks.noise import RAYLEIGH_MEDIAN
@@ -23,9 +23,6 @@ MIN_ANCHORS, MIN_WIDTH = 6, 0.3
 """Minimum number of anchors, in total and visible in a frame to use it, and minimum standard deviation of their template positions in
 the direction in which they extend least, relative to the template's: anchors on a line do not determine the pose of the surface. A rolled
 sheet of 7 × 7 points, one frame of which shows one or two rows: the error of that frame is .06, and .26 to .64 with any width."""
-
-STIFF = 1e-3
-"""Smoothing of the splines, in units of the template's squared standard deviation; needed because the anchors' depths are not exact."""
 
 OUTLIER_DEVIATIONS = 8.0
 """Distance from the surface's image, in robust standard deviations, beyond which an observation is an outlier."""
@@ -118,14 +115,11 @@ def extend(
         Standard deviation of observations of full confidence, pixels; 0 if it is unknown, for points that lie where the tracks show them.
     """
     seen, sure = confidence > 0, np.sqrt(confidence)
-    place = _placed(tracks, seen, images, known, template)
+    surface = TemplateMap.of(template, anchors, focal, centre)
+    place = places_of(surface, tracks, sure, images, known)
     placed: NDArray[np.bool_] = np.asarray(np.isfinite(place).all(axis=1))
-    flat = anchors.transpose(1, 0, 2).reshape(len(template), -1)
-    space = spline(template, flat, np.where(placed[:, None], place, 0.0))
-    space = space.reshape(-1, len(anchors), 3).transpose(1, 0, 2).copy()
-    nearest = 1e-3 * float(np.median(anchors[..., 2]))
-    space[..., 2] = np.maximum(space[..., 2], nearest)
-    image = focal * space[..., :2] / space[..., 2:] + centre
+    space = surface.space(np.where(placed[:, None], place, 0.0))
+    image = surface.image(space)
     off = sure * np.linalg.norm(image - tracks, axis=2)
     compared = seen & placed
     limit = OUTLIER_DEVIATIONS * max(
@@ -154,42 +148,6 @@ def _deviation(images: Floats, known: NDArray[np.bool_]) -> float:
     count = np.maximum(known.sum(axis=1), 1)[:, None, None]
     mean = np.where(known[..., None], images, 0.0).sum(axis=1, keepdims=True) / count
     return float((images - mean)[known].std())
-
-
-def spline(source: Floats, values: Floats, target: Floats) -> Floats:
-    """Return the smoothing thin-plate spline of `values (N, k)` at `source (N, 2)`, evaluated at `target (M, 2)`."""
-    count = len(source)
-    affine = np.concatenate([np.ones((count, 1)), source], axis=1)
-    matrix = np.zeros((count + 3, count + 3))
-    matrix[:count, :count] = _kernel(source, source) + STIFF * np.eye(count)
-    matrix[:count, count:], matrix[count:, :count] = affine, affine.T
-    matrix[count:, count:] = -1e-9 * np.eye(3)  # collinear sources do not determine the affine part
-    weights = np.linalg.solve(matrix, np.concatenate([values, np.zeros((3, values.shape[1]))]))
-    return np.asarray(_kernel(target, source) @ weights[:count] + weights[count] + target @ weights[count + 1 :])
-
-
-def _kernel(target: Floats, source: Floats) -> Floats:
-    """Return r² log r between all pairs."""
-    square = np.square(target[:, None, 0] - source[:, 0]) + np.square(target[:, None, 1] - source[:, 1])
-    return np.asarray(0.5 * square * np.log(np.maximum(square, np.finfo(np.float64).tiny)))
-
-
-def _placed(
-    tracks: Floats, seen: NDArray[np.bool_], images: Floats, known: NDArray[np.bool_], template: Floats
-) -> Floats:
-    """Return template positions `(P, 2)`, medians over frames; NaN for points in no usable frame or far outside the template."""
-    found = np.full((*seen.shape, 2), np.nan)
-    for frame in np.flatnonzero(known.sum(axis=1) >= MIN_ANCHORS):
-        source = images[frame, known[frame]]
-        middle = source.mean(axis=0)
-        size = max(float((source - middle).std()), np.finfo(np.float64).tiny)
-        target = (tracks[frame, seen[frame]] - middle) / size
-        found[frame, seen[frame]] = spline((source - middle) / size, template[known[frame]], target)
-    place = np.full((seen.shape[1], 2), np.nan)
-    ever = np.isfinite(found[..., 0]).any(axis=0)
-    place[ever] = np.nanmedian(found[:, ever], axis=0)
-    # A point that lies beyond the anchors by more than the template's width is not on the surface.
-    return np.where(np.abs(place).max(axis=1, keepdims=True) <= 3 * np.abs(template).max(), place, np.nan)
 
 
 def _enough(template: Floats, shown: NDArray[np.bool_]) -> bool:

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.anchors import Anchors
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
-from pliant.solver.isometry.refinement import Isometry, refine
+from pliant.solver.isometry.refinement import Isometry
+from pliant.solver.isometry.restarts import refine_with_restarts
 from pliant.solver.pulse import ShouldStop
 from pliant.solver.records import Floats
 
@@ -173,7 +174,11 @@ def tried_at(search: FocalSearch, focal: float, near: Tried | None) -> Tried | N
         depths = maximum_depth(graph, should_stop=search.should_stop)
     else:
         depths = _carried(near.found.depths, graph.seen, focal / near.focal)
-    return Tried(focal, refine(graph, depths, should_stop=search.should_stop)) if depths is not None else None
+    return (
+        Tried(focal, refine_with_restarts(graph, depths, should_stop=search.should_stop))
+        if depths is not None
+        else None
+    )
 
 
 def _carried(depths: Floats, seen: NDArray[np.bool_], ratio: float) -> Floats:

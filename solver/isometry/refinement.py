@@ -121,8 +121,7 @@ def refine(graph: SurfaceGraph, depths: Floats, *, iterations: int = 30, should_
     lengths = typical(edge_lengths(graph, depths))
     floor = 1e-6 * float(depths.max())
     log_depths = np.log(np.maximum(depths[graph.seen], floor))
-    first, _ = residuals(graph, log_depths, lengths)
-    ease = max(EASE * float(np.median(np.abs(first))), MIN_EASE * float(lengths[lengths > 0].mean()))
+    ease = ease_of(residuals(graph, log_depths, lengths)[0], lengths)
     here, damping = _at(graph, log_depths, lengths, ease), 1e-3
     for _ in range(iterations):
         if should_stop():
@@ -141,13 +140,27 @@ def refine(graph: SurfaceGraph, depths: Floats, *, iterations: int = 30, should_
 
 def _at(graph: SurfaceGraph, log_depths: Floats, lengths: Floats, ease: float) -> _Point:
     left, jacobian = residuals(graph, log_depths, lengths)
-    return _Point(log_depths, lengths, left, jacobian, float(ease**2 * (np.hypot(1.0, left / ease) - 1).sum()))
+    return _Point(log_depths, lengths, left, jacobian, float(losses_of(left, ease).sum()))
+
+
+def ease_of(left: Floats, lengths: Floats) -> float:
+    """Return ε of the loss for the residuals at the start."""
+    return max(EASE * float(np.median(np.abs(left))), MIN_EASE * float(lengths[lengths > 0].mean()))
+
+
+def losses_of(left: Floats, ease: float) -> Floats:
+    """Return ρ of every residual."""
+    return np.asarray(ease**2 * (np.hypot(1.0, left / ease) - 1))
+
+
+def weights_of(left: Floats, ease: float) -> Floats:
+    """Return the weight of every residual in the least squares that replace ρ."""
+    return np.asarray(1 / np.hypot(1.0, left / ease))
 
 
 def _lower(graph: SurfaceGraph, here: _Point, damping: float, ease: float) -> tuple[_Point | None, float]:
     """Return the next iterate of lower cost, or None if no step lowers it, and the damping of the next step."""
-    weight = 1 / np.hypot(1.0, here.residuals / ease)
-    weighted = sparse.csr_matrix(sparse.diags(weight) @ here.jacobian)
+    weighted = sparse.csr_matrix(sparse.diags(weights_of(here.residuals, ease)) @ here.jacobian)
     normal = (here.jacobian.T @ weighted).tocsr()
     gradient = weighted.T @ here.residuals
     factor = 0.1  # 1 after a failed step, so that the damping that succeeds is kept
@@ -176,7 +189,7 @@ def gauss_newton_step(graph: SurfaceGraph, normal: sparse.csr_matrix, gradient: 
     count = int(graph.seen.sum())
     between, weights = normal[:count, count:], diagonal[count:]
     across = between.T.tocsr()
-    inverse = np.linalg.inv(_blocks(graph, normal[:count, :count], diagonal[:count]))
+    inverse = np.linalg.inv(blocks_of(graph, normal[:count, :count], diagonal[:count]))
 
     def eliminated(right: Floats) -> Floats:
         wide = np.zeros(graph.seen.shape)
@@ -193,7 +206,7 @@ def gauss_newton_step(graph: SurfaceGraph, normal: sparse.csr_matrix, gradient: 
     return np.concatenate([-eliminated(gradient[:count] + between @ lengths), lengths])
 
 
-def _blocks(graph: SurfaceGraph, depths: sparse.csr_matrix, diagonal: Floats) -> Floats:
+def blocks_of(graph: SurfaceGraph, depths: sparse.csr_matrix, diagonal: Floats) -> Floats:
     """Return the block of every frame, shape `(F, A, A)`, from the equations of the visible depths; 1 on the diagonal of hidden ones."""
     frames, anchors = graph.seen.shape
     frame, anchor = np.nonzero(graph.seen)

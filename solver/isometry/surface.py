@@ -20,6 +20,7 @@ from pliant.solver.isometry.focal_sweep import CLEAR, FocalSearch, Judgement, Tr
 from pliant.solver.isometry.homographies import off_homography
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import Isometry, edge_lengths, inconsistency, refine, typical
+from pliant.solver.isometry.restarts import carried, refine_with_restarts, unlikeness
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, Tracks
 from pliant.solver.tracks.normalization import relative
@@ -287,14 +288,14 @@ def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried) -> Isometric
     part = search.graph(chosen.focal, search.frames)
     whole = search.graph(chosen.focal)
     afresh = maximum_depth(part, should_stop=search.should_stop)
-    found = chosen.found if afresh is None else refine(part, afresh, should_stop=search.should_stop)
+    found = chosen.found if afresh is None else refine_with_restarts(part, afresh, should_stop=search.should_stop)
     found = min(found, chosen.found, key=lambda each: each.inconsistency)
     if len(search.frames) < tracks.num_frames:
-        found = refine(whole, _from_similar(whole, search, found.depths), should_stop=search.should_stop)
+        found = refine_with_restarts(whole, _from_similar(whole, search, found.depths), should_stop=search.should_stop)
     if not search.should_stop():
         # Short edges only: the chord of a long one is shorter than the surface between its ends.
         near = replace(whole, edges=nearest_neighbours(search.anchors.points, search.seen, neighbours=LAST_NEIGHBOURS))
-        depths = refine(near, found.depths, should_stop=search.should_stop).depths
+        depths = refine_with_restarts(near, found.depths, should_stop=search.should_stop).depths
         lengths = edge_lengths(whole, depths)
         found = Isometry(depths, typical(lengths), inconsistency(lengths))
     template = flatten(search.edges, found.lengths, search.seen.shape[1])
@@ -316,18 +317,7 @@ def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried) -> Isometric
 
 def _from_similar(graph: SurfaceGraph, search: FocalSearch, depths: Floats) -> Floats:
     """Return starting depths `(F, A)` of all frames, copied from the solved frame with the most similar image."""
-    start = np.zeros(graph.seen.shape)
-    rays, seen = graph.rays[search.frames], graph.seen[search.frames]
-    for frame in range(len(start)):
-        both = seen & graph.seen[frame]
-        off = np.where(both[..., None], rays - graph.rays[frame], 0.0)
-        count = np.maximum(both.sum(axis=1), 1)
-        off -= np.where(both[..., None], off.sum(axis=1, keepdims=True) / count[:, None, None], 0.0)
-        unlike = np.where(both.sum(axis=1) >= 2, np.square(off).sum(axis=(1, 2)) / count, np.inf)
-        like = int(unlike.argmin())
-        mean = float(depths[like][seen[like]].mean()) if seen[like].any() else 1.0
-        start[frame] = np.where(graph.seen[frame], np.where(seen[like], depths[like], mean), 0.0)
-    return start
+    return carried(depths[unlikeness(graph, search.frames).argmin(axis=0)], graph)
 
 
 def _centre(

@@ -87,7 +87,7 @@ def test_weaker_evidence_needs_halves_that_agree_better(
 
 
 @pytest.mark.slow
-def test_weak_evidence_decides_only_against_a_free_surface_that_differs() -> None:
+def test_weak_evidence_decides_only_against_a_free_surface_that_differs_and_is_not_good() -> None:
     sheet = rolled(frames=6, side=7)
     accepted = isometric_surface(sheet.tracks, focal=FOCAL, image_size=SIZE)
     weak = replace(accepted, weak=True)
@@ -99,13 +99,19 @@ def test_weak_evidence_decides_only_against_a_free_surface_that_differs() -> Non
     assert kept.shapes is alike.shapes
     assert kept.choices.reasons["surface"].startswith("Solved as a free surface, which differs")
     assert kept.choices.focal_lengths == weak.focal_lengths
-    flat = replace(alike, shapes=alike.shapes * (1, 1, 0))
+    assert free.trust is not None
+    doubted = replace(free.trust, verdict=Verdict.WITH_CARE)
+    flat = replace(alike, shapes=alike.shapes * (1, 1, 0), trust=doubted)
     chosen = with_verdict(flat, sheet.tracks, weak, Settings(), monitor, began=0.0)
     assert one_scale_error(chosen.shapes, sheet.points) < 0.015
     assert chosen.choices.reasons["surface"].startswith("Taken as an isometric sheet")
     assert chosen.trust is not None
     assert chosen.trust.verdict is Verdict.WITH_CARE
     assert "Solve with surface=free, too, and look at both from the side" in chosen.trust.reasons[0]
+    good = replace(flat, trust=replace(doubted, verdict=Verdict.GOOD))
+    kept = with_verdict(good, sheet.tracks, weak, Settings(), monitor, began=0.0)
+    assert kept.shapes is good.shapes
+    assert kept.choices.reasons["surface"].startswith("Solved as a free surface, whose verdict is good. The evidence")
 
 
 def test_fewer_than_two_frames_per_half_confirm_nothing() -> None:
