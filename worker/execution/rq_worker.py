@@ -75,7 +75,7 @@ class Delivery(RqJob):
         try:
             work.run(arguments[0], arguments[1], settings=self.settings, worker=str(self.worker_name))
         except StoreUnavailable as error:
-            logger.warning("job %s: the outcome is not recorded: %s", arguments[0], error)
+            logger.warning("job %s: the outcome is not recorded: %s", arguments[0], error, extra={"job": arguments[0]})
             # RQ would end with the code of any error, and the worker could not tell an outage from a crash.
             os._exit(UNRECORDED)
 
@@ -259,7 +259,7 @@ class PliantWorker(Worker):
                 deadline.retry(lambda: order_waiting(self._records, self._deliveries, [settled.owner]))
             deadline.retry(lambda: self._deliveries.remove(job.id))
         except StoreUnavailable as error:
-            logger.warning("job %s: %s; the reconciler will requeue it", watch.id, error)
+            logger.warning("job %s: %s; the reconciler will requeue it", watch.id, error, extra={"job": watch.id})
         finally:
             with suppress(StoreUnavailable):  # otherwise the reconciler removes the files
                 if not deadline.retry(lambda: self._elsewhere(watch)):

@@ -175,7 +175,7 @@ class WebhookSender:
             else:
                 await asyncio.to_thread(self._handle_status, lease, status)
         except StoreUnavailable as error:  # the message is sent again after the lease
-            logger.warning("webhook of job %s: %s", lease.id, error)
+            logger.warning("webhook of job %s: %s", lease.id, error, extra={"job": lease.id})
 
     async def _post(self, webhook: Webhook, *, id: str, body: bytes) -> int:
         """Send to the first checked address that accepts a connection; return the status of the response, whose body is not read."""
@@ -240,7 +240,7 @@ class WebhookSender:
         self.outbox.given_up(lease)
 
     def _log(self, id: str, sentence: str) -> None:
-        logger.info("job %s: %s", id, sentence)
+        logger.info("job %s: %s", id, sentence, extra={"job": id})
         self.records.append_log(id, dated(sentence))
 
 
