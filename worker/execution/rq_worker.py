@@ -32,7 +32,7 @@ from pliant.worker.records import Records
 from pliant.worker.settings import Settings
 from pliant.worker.store.queue import FUNCTION, Queue, alive_key
 from rq import Queue as RqQueue
-from rq import Worker
+from rq import Worker, worker_registration
 from rq.exceptions import StopRequested
 from rq.job import Job as RqJob
 from rq.serializers import JSONSerializer
@@ -155,6 +155,8 @@ class PliantWorker(Worker):
             super().heartbeat(timeout, pipeline)
             sign = f"{os.getpid()} {self._memory}"
             target.set(alive_key(self._settings.queue, self.name), sign, ex=ALIVE_FOR)
+            # The clean-up removes a worker that was cut off from the store, and a store may lose its data.
+            worker_registration.register(self, target)
         except AWAY as error:
             logger.warning("heartbeat not written: %s", error)
 
