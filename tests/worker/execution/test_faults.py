@@ -327,7 +327,7 @@ def test_invalid_arguments_and_settings_are_reported(tmp_path: Path) -> None:
     assert "PLIANT_WORKERS: expected a whole number" in unset.stderr
     for store, sentence in {
         "http://host": "PLIANT_REDIS_URL: expected a URL redis://, rediss:// or unix://, got another text.",
-        "unix:///nowhere/none.sock": "The job store at unix:///nowhere/none.sock is unavailable (ConnectionError).",
+        "unix:///nowhere/none.sock": "The job store at unix:///nowhere/none.sock is unavailable (No such file or directory).",
     }.items():
         ended = run("work", PLIANT_REDIS_URL=store, PLIANT_DATA=str(tmp_path))
         assert (ended.returncode, ended.stderr.count("\n"), ended.stderr.startswith(sentence)) == (1, 1, True), (
