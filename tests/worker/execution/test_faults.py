@@ -336,6 +336,18 @@ def test_invalid_arguments_and_settings_are_reported(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_data_directory_that_cannot_be_made_is_named(settings: Settings, tmp_path: Path) -> None:
+    """By each process that may be started alone; a worker ended with a traceback, the others named no directory."""
+    (tmp_path / "file").touch()
+    env = {**os.environ, **settings.to_environment(), "PLIANT_DATA": str(tmp_path / "file" / "data")}
+    for command in (["pliant.worker", "work"], ["pliant.worker", "reconcile"], ["pliant.service"]):
+        ended = subprocess.run([sys.executable, "-m", *command], capture_output=True, text=True, check=False, env=env)
+        assert ended.returncode in (1, 2)
+        assert ended.stderr.startswith("PLIANT_DATA: expected a folder that this user can create and write, got '")
+        assert "(Not a directory). Make the folder for the user that runs Pliant" in ended.stderr
+
+
+@pytest.mark.slow
 def test_the_fsck_command_reports_inconsistencies(house: House) -> None:
     command = [sys.executable, "-m", "pliant.cli", "fsck"]
     env = {**os.environ, **house.settings.to_environment()}
