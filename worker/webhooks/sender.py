@@ -171,7 +171,7 @@ class WebhookSender:
             except NotPublic as error:
                 await asyncio.to_thread(self._give_up, lease, str(error))
             except _failures() as error:
-                await asyncio.to_thread(self._again, lease, type(error).__name__)
+                await asyncio.to_thread(self._again, lease, _why(error))
             else:
                 await asyncio.to_thread(self._handle_status, lease, status)
         except StoreUnavailable as error:  # the message is sent again after the lease
@@ -261,6 +261,16 @@ def _log_error(task: asyncio.Task[None]) -> None:
     """Log an unexpected error; the message is sent again after its lease."""
     if not task.cancelled() and (error := task.exception()) is not None:
         logger.error("webhook not sent", exc_info=error)
+
+
+def _why(error: BaseException) -> str:
+    """Return the type of the error, which reveals nothing about internal hosts, or what is wrong with the receiver's certificate."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, ssl.SSLCertVerificationError):
+            return f"the receiver's certificate is not accepted: {cause.verify_message.rstrip('.')}"
+        cause = cause.__cause__ or cause.__context__
+    return type(error).__name__
 
 
 def _failures() -> tuple[type[Exception], ...]:
