@@ -16,7 +16,7 @@ from pliant.worker.execution.rq_worker import PliantWorker
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.logs import LogSettings, configure_logging
 from pliant.worker.maintenance.reconciler import Reconciler
-from pliant.worker.paths import make_data_directory
+from pliant.worker.processes.preflight import open_data_directory
 from pliant.worker.settings import NUMERICAL_THREADS, Settings
 from pliant.worker.store.connection import BLOCK_WITHIN, connect, reachable
 from pliant.worker.store.outage import described
@@ -49,7 +49,7 @@ def work(settings: Settings) -> int:
         importlib.import_module(module)
     gc.collect()
     gc.freeze()  # otherwise the first garbage collection of every job process would copy all shared pages
-    make_data_directory(settings.data)
+    open_data_directory(settings)
     quick, text = (
         connect(settings.redis, decode=decode, retries=0, answer_within=WATCH_ANSWERS_WITHIN)
         for decode in (False, True)
@@ -80,6 +80,8 @@ def reconcile(settings: Settings) -> int:
 
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
+    if settings.blob_url is None:
+        open_data_directory(settings)
     jobs = Jobs.open(settings)
     jobs.records.ping()  # the supervisor repeats a start without a store
     sender = WebhookSender.open(settings, jobs.records)

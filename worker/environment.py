@@ -130,6 +130,10 @@ def _found(record: type[Any]) -> BaseModel:
         def drop_empty(cls, given: dict[str, Any]) -> dict[str, Any]:
             return {name: value for name, value in given.items() if value != ""}  # empty secret files
 
+    secrets = {variable_of(name).lower() for name in known}
+    for file in Path(folder).iterdir() if (folder := _secrets()) is not None else ():
+        if file.name.lower() in secrets and file.is_file():
+            _check_readable(file)
     spelled: dict[str, Any] = {name: (field.annotation, field) for name, field in known.items()}
     try:
         return create_model("Environment", __base__=Environment, **spelled)()
@@ -140,8 +144,29 @@ def _found(record: type[Any]) -> BaseModel:
 
 
 def _dotenv() -> str | None:
-    """Return `.env`; None in a directory that this user may not enter, such as the home of whoever calls `sudo -u`."""
-    return ".env" if os.access(".", os.X_OK) else None
+    """Return `.env`; None in a directory that this user may not enter, such as the home of whoever calls `sudo -u`.
+
+    Raises
+    ------
+    InvalidSetting
+        There is such a file, but this user cannot read it, or it is not UTF-8.
+    """
+    if not os.access(".", os.X_OK):
+        return None
+    if Path(".env").is_file():
+        _check_readable(Path(".env"))
+    return ".env"
+
+
+def _check_readable(file: Path) -> None:
+    try:
+        file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as fault:
+        got = fault.strerror if isinstance(fault, OSError) else "other bytes"
+        hint = "Let the user that runs Pliant read the file, or correct its encoding."
+        raise InvalidSetting(
+            str(file), expected="a file in UTF-8 that this user can read", got=str(got), hint=hint
+        ) from None
 
 
 def _secrets() -> str | None:

@@ -87,7 +87,7 @@ def test_an_interruption_while_waiting_for_the_store_starts_nothing(
     monkeypatch.setattr("time.sleep", interrupted)
     result = run(command, PLIANT_REDIS_URL="redis://:secret@127.0.0.1:9")
     assert result.exit_code == Exit.DONE
-    assert result.output.count("The job store at redis://127.0.0.1:9 is unavailable (ConnectionError).") == 1
+    assert result.output.count("The job store at redis://127.0.0.1:9 is unavailable (Connection refused).") == 1
     assert "secret" not in result.output
 
 

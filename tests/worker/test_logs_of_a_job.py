@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import secrets
@@ -10,14 +11,14 @@ import sys
 from pathlib import Path
 
 import httpx
+import pliant.worker
 import pytest
 from pliant.schemas.job import Status
 from pliant.worker.settings import Settings
 from serving import form, free_port, until
 
-pytestmark = pytest.mark.slow
 
-
+@pytest.mark.slow
 def test_every_process_logs_the_job_by_its_id(settings: Settings, tmp_path: Path) -> None:
     port, key = free_port(), secrets.token_hex(4)
     env = {
@@ -55,3 +56,21 @@ def test_every_process_logs_the_job_by_its_id(settings: Settings, tmp_path: Path
     assert [message.split(": ")[1] for message in messages] == ["attempt 1 began", "attempt 1 ended"]
     assert {line["attempt"] for line in ours["worker"]} == {1}
     assert ours["worker"][-1]["outcome"] == "succeeded"
+
+
+def test_every_line_about_a_job_has_the_field_job() -> None:
+    """Those of lost workers and webhooks, too."""
+    worker = Path(pliant.worker.__file__).parent
+    found, without = 0, []
+    for source in sorted(worker.rglob("*.py")):
+        for node in ast.walk(ast.parse(source.read_text())):
+            if (
+                isinstance(node, ast.Call)
+                and ast.unparse(node.func).startswith("logger.")
+                and "job %s" in ast.unparse(node.args[0])
+            ):
+                found += 1
+                if not any(each.arg == "extra" for each in node.keywords):
+                    without.append(f"{source.name}:{node.lineno}")
+    assert found >= 9
+    assert without == []

@@ -101,6 +101,36 @@ def test_a_directory_that_may_not_be_entered_has_no_env_file(
     assert Settings.from_environment().workers == Settings().workers
 
 
+@pytest.mark.parametrize("file", [".env", "secrets/PLIANT_QUEUE"])
+@pytest.mark.parametrize(
+    ("fault", "got"),
+    [
+        (PermissionError(13, "Permission denied"), "Permission denied"),
+        (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"), "other bytes"),
+    ],
+)
+def test_a_file_of_settings_that_cannot_be_read_is_named(
+    set_variables: Callable[..., None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    file: str,
+    fault: Exception,
+    got: str,
+) -> None:
+    (tmp_path / "secrets").mkdir()
+    (tmp_path / file).write_text("PLIANT_WORKERS=2\n")
+    set_variables(SECRETS_DIR=str(tmp_path / "secrets"))
+    Settings.from_environment()
+
+    def refused(*_: object, **__: object) -> str:
+        raise fault
+
+    monkeypatch.setattr(Path, "read_text", refused)
+    sentence = f"{re.escape(file)}: expected a file in UTF-8 that this user can read, got {got}"
+    with pytest.raises(InvalidSetting, match=sentence):
+        Settings.from_environment()
+
+
 def test_a_missing_secrets_folder_is_an_error(set_variables: Callable[..., None], tmp_path: Path) -> None:
     set_variables(SECRETS_DIR=str(tmp_path / "none"))
     with pytest.raises(InvalidSetting, match="PLIANT_SECRETS_DIR: expected a folder"):

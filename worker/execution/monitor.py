@@ -162,7 +162,7 @@ def finalize(watch: Watch, *, status: int, peak: int, deadline: RetryDeadline) -
         settled = deadline.retry(record_verdict)
     except (StaleAttempt, UnknownJob):
         return None
-    logger.warning("job %s: %s", watch.id, sentence)
+    logger.warning("job %s: %s", watch.id, sentence, extra={"job": watch.id})
     return settled
 
 

@@ -32,7 +32,7 @@ from pliant.worker.records import Records
 from pliant.worker.settings import Settings
 from pliant.worker.store.queue import FUNCTION, Queue, alive_key
 from rq import Queue as RqQueue
-from rq import Worker
+from rq import Worker, worker_registration
 from rq.exceptions import StopRequested
 from rq.job import Job as RqJob
 from rq.serializers import JSONSerializer
@@ -75,7 +75,7 @@ class Delivery(RqJob):
         try:
             work.run(arguments[0], arguments[1], settings=self.settings, worker=str(self.worker_name))
         except StoreUnavailable as error:
-            logger.warning("job %s: the outcome is not recorded: %s", arguments[0], error)
+            logger.warning("job %s: the outcome is not recorded: %s", arguments[0], error, extra={"job": arguments[0]})
             # RQ would end with the code of any error, and the worker could not tell an outage from a crash.
             os._exit(UNRECORDED)
 
@@ -155,6 +155,8 @@ class PliantWorker(Worker):
             super().heartbeat(timeout, pipeline)
             sign = f"{os.getpid()} {self._memory}"
             target.set(alive_key(self._settings.queue, self.name), sign, ex=ALIVE_FOR)
+            # The clean-up removes a worker that was cut off from the store, and a store may lose its data.
+            worker_registration.register(self, target)
         except AWAY as error:
             logger.warning("heartbeat not written: %s", error)
 
@@ -259,7 +261,7 @@ class PliantWorker(Worker):
                 deadline.retry(lambda: order_waiting(self._records, self._deliveries, [settled.owner]))
             deadline.retry(lambda: self._deliveries.remove(job.id))
         except StoreUnavailable as error:
-            logger.warning("job %s: %s; the reconciler will requeue it", watch.id, error)
+            logger.warning("job %s: %s; the reconciler will requeue it", watch.id, error, extra={"job": watch.id})
         finally:
             with suppress(StoreUnavailable):  # otherwise the reconciler removes the files
                 if not deadline.retry(lambda: self._elsewhere(watch)):

@@ -195,7 +195,9 @@ class Jobs:
         """
         stored = self.stored(id)
         if not stored.job.status.final:
-            raise NotAllowedNow(id, stored.job.status, wanted="deleted", hint="Cancel it first.")
+            stopping = stored.job.status is Status.CANCELLING
+            hint = "Delete it when it is cancelled." if stopping else "Cancel it first."
+            raise NotAllowedNow(id, stored.job.status, wanted="deleted", hint=hint)
         self.records.delete(stored, at=self.clock())
         with suppress(StoreUnavailable):
             for attempt_id in {stored.inputs.split("/")[2], stored.attempt_id}:

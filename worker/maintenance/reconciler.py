@@ -215,5 +215,5 @@ class Reconciler:
                 self.jobs.blobs.delete(key)
 
     def _log(self, id: str, sentence: str) -> None:
-        logger.warning("job %s: %s", id, sentence)
+        logger.warning("job %s: %s", id, sentence, extra={"job": id})
         self.jobs.records.append_log(id, dated(sentence))

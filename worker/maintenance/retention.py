@@ -98,7 +98,7 @@ class Retention:
                         if self.jobs.get(job.id).created_at != job.created_at:
                             continue
                         self.jobs.delete(job.id)
-                        logger.info("job %s: expired and removed", job.id)
+                        logger.info("job %s: expired and removed", job.id, extra={"job": job.id})
             cursor = page.next
             if cursor is None:
                 return

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from pliant.worker.environment import variable_of
 from pliant.worker.errors import InvalidSetting, StoreUnavailable
+from pliant.worker.paths import make_data_directory
 from pliant.worker.processes.memory import check_workers
 from pliant.worker.settings import Settings
 
@@ -40,6 +41,25 @@ def check_settings(settings: Settings) -> None:
                 got=repr(settings.blob_url),
                 hint=f"Make the folder for the user that runs Pliant, or name another one ({fault.reason}).",
             ) from fault
+
+
+def open_data_directory(settings: Settings) -> None:
+    """Create the data directory and its folders.
+
+    Raises
+    ------
+    InvalidSetting
+        The user of this process cannot create or write it.
+    """
+    try:
+        make_data_directory(settings.data)
+    except OSError as fault:
+        raise InvalidSetting(
+            variable_of("data"),
+            expected="a folder that this user can create and write",
+            got=f"{str(settings.data)!r} ({fault.strerror})",
+            hint="Make the folder for the user that runs Pliant, or name another one.",
+        ) from fault
 
 
 def wait_for_store(settings: Settings, tell: Callable[[str], None], *, within: float | None = None) -> None:

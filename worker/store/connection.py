@@ -73,10 +73,12 @@ def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | 
             health_check_interval=15,
             retry=Retry(ExponentialWithJitterBackoff(base=0.05, cap=0.5), retries, (redis.ConnectionError,)),
         )
-    except ValueError:
+        pool = client.connection_pool
+        pool.connection_class(**pool.connection_kwargs)  # refuses unknown parameters in the query of the URL
+    except (ValueError, TypeError, redis.RedisError):
         raise InvalidSetting(
             "PLIANT_REDIS_URL", expected="a URL redis://, rediss:// or unix://", got="another text",
-            hint="Percent-encode special characters of the password.",
+            hint="Percent-encode special characters of the password, and check the parameters after `?`.",
         ) from None  # fmt: skip
     if isinstance(client, _Client):
         client.server = _SILENCE.setdefault(url, SilentServer())
@@ -133,11 +135,19 @@ def reachable() -> Iterator[None]:
         yield
     except redis.AuthenticationError as error:
         raise StoreUnavailable(JOB_STORE, reason="it refuses the password") from error
+    except redis.InvalidResponse as error:
+        raise StoreUnavailable(JOB_STORE, reason="another program than Redis answers") from error
     except (redis.ConnectionError, redis.TimeoutError, redis.exceptions.ClusterDownError) as error:
-        raise StoreUnavailable(JOB_STORE, reason=type(error).__name__) from error
+        raise StoreUnavailable(JOB_STORE, reason=_reason(error)) from error
     except redis.OutOfMemoryError as error:
         raise StoreUnavailable(JOB_STORE, reason="its memory limit is reached") from error
     except redis.ResponseError as error:
         if not str(error).startswith(("MISCONF", "LOADING", "READONLY")):
             raise
         raise StoreUnavailable(JOB_STORE, reason=str(error)[:200]) from error
+
+
+def _reason(error: redis.RedisError) -> str:
+    """Return what the operating system or OpenSSL says, without the address; the type of the error if they say nothing."""
+    cause = error.__cause__ or error.__context__
+    return (cause.strerror if isinstance(cause, OSError) else None) or type(error).__name__

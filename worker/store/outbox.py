@@ -27,11 +27,11 @@ _LEASED = """
 if tonumber(redis.call('ZSCORE', ARGV[1] .. 'outbox', ARGV[2]) or -1) ~= tonumber(ARGV[3]) then return 0 end
 """
 
-# ARGV: 4 when it is due, 5 attempts to subtract
+# ARGV: 4 when it is due, 5 attempts to add, 0 or -1. Not subtracted here: Redis 7.0 would pass -0 as "-0", which HINCRBY refuses.
 _LATER = f"""{_LEASED}
 redis.call('ZADD', ARGV[1] .. 'outbox', ARGV[4], ARGV[2])
-redis.call('HINCRBY', ARGV[1] .. 'outbox:tries', ARGV[2], -ARGV[5])
-redis.call('HINCRBY', ARGV[1] .. 'tally', 'webhooks:tried', -ARGV[5])
+redis.call('HINCRBY', ARGV[1] .. 'outbox:tries', ARGV[2], ARGV[5])
+redis.call('HINCRBY', ARGV[1] .. 'tally', 'webhooks:tried', ARGV[5])
 return 1
 """
 
@@ -86,15 +86,15 @@ class Outbox:
 
     def later(self, lease: Lease, *, due: int) -> None:
         """Schedule the next attempt at a message."""
-        self._scheduled(lease, due, subtracted=0)
+        self._scheduled(lease, due, added=0)
 
     def postpone(self, lease: Lease, *, due: int) -> None:
         """Return a leased message that was not sent; the lease does not count as an attempt."""
-        self._scheduled(lease, due, subtracted=1)
+        self._scheduled(lease, due, added=-1)
 
-    def _scheduled(self, lease: Lease, due: int, *, subtracted: int) -> None:
+    def _scheduled(self, lease: Lease, due: int, *, added: int) -> None:
         with reachable():
-            self._later(args=[self._at, lease.id, lease.until, due, subtracted])
+            self._later(args=[self._at, lease.id, lease.until, due, added])
 
     def _closed(self, lease: Lease, tally: str) -> None:
         with reachable():

@@ -171,11 +171,11 @@ class WebhookSender:
             except NotPublic as error:
                 await asyncio.to_thread(self._give_up, lease, str(error))
             except _failures() as error:
-                await asyncio.to_thread(self._again, lease, type(error).__name__)
+                await asyncio.to_thread(self._again, lease, _why(error))
             else:
                 await asyncio.to_thread(self._handle_status, lease, status)
         except StoreUnavailable as error:  # the message is sent again after the lease
-            logger.warning("webhook of job %s: %s", lease.id, error)
+            logger.warning("webhook of job %s: %s", lease.id, error, extra={"job": lease.id})
 
     async def _post(self, webhook: Webhook, *, id: str, body: bytes) -> int:
         """Send to the first checked address that accepts a connection; return the status of the response, whose body is not read."""
@@ -240,7 +240,7 @@ class WebhookSender:
         self.outbox.given_up(lease)
 
     def _log(self, id: str, sentence: str) -> None:
-        logger.info("job %s: %s", id, sentence)
+        logger.info("job %s: %s", id, sentence, extra={"job": id})
         self.records.append_log(id, dated(sentence))
 
 
@@ -261,6 +261,16 @@ def _log_error(task: asyncio.Task[None]) -> None:
     """Log an unexpected error; the message is sent again after its lease."""
     if not task.cancelled() and (error := task.exception()) is not None:
         logger.error("webhook not sent", exc_info=error)
+
+
+def _why(error: BaseException) -> str:
+    """Return the type of the error, which reveals nothing about internal hosts, or what is wrong with the receiver's certificate."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, ssl.SSLCertVerificationError):
+            return f"the receiver's certificate is not accepted: {cause.verify_message.rstrip('.')}"
+        cause = cause.__cause__ or cause.__context__
+    return type(error).__name__
 
 
 def _failures() -> tuple[type[Exception], ...]:

@@ -327,12 +327,24 @@ def test_invalid_arguments_and_settings_are_reported(tmp_path: Path) -> None:
     assert "PLIANT_WORKERS: expected a whole number" in unset.stderr
     for store, sentence in {
         "http://host": "PLIANT_REDIS_URL: expected a URL redis://, rediss:// or unix://, got another text.",
-        "unix:///nowhere/none.sock": "The job store at unix:///nowhere/none.sock is unavailable (ConnectionError).",
+        "unix:///nowhere/none.sock": "The job store at unix:///nowhere/none.sock is unavailable (No such file or directory).",
     }.items():
         ended = run("work", PLIANT_REDIS_URL=store, PLIANT_DATA=str(tmp_path))
         assert (ended.returncode, ended.stderr.count("\n"), ended.stderr.startswith(sentence)) == (1, 1, True), (
             ended.stderr
         )
+
+
+@pytest.mark.slow
+def test_a_data_directory_that_cannot_be_made_is_named(settings: Settings, tmp_path: Path) -> None:
+    """By each process that may be started alone; a worker ended with a traceback, the others named no directory."""
+    (tmp_path / "file").touch()
+    env = {**os.environ, **settings.to_environment(), "PLIANT_DATA": str(tmp_path / "file" / "data")}
+    for command in (["pliant.worker", "work"], ["pliant.worker", "reconcile"], ["pliant.service"]):
+        ended = subprocess.run([sys.executable, "-m", *command], capture_output=True, text=True, check=False, env=env)
+        assert ended.returncode in (1, 2)
+        assert ended.stderr.startswith("PLIANT_DATA: expected a folder that this user can create and write, got '")
+        assert "(Not a directory). Make the folder for the user that runs Pliant" in ended.stderr
 
 
 @pytest.mark.slow

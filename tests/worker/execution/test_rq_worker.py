@@ -69,3 +69,25 @@ def test_an_idle_worker_returns_soon_after_each_of_many_outages(
     assert max(pauses) < ALIVE_FOR / 2
     for each in (connection, text):
         each.close()
+
+
+def test_a_worker_is_listed_again_after_the_store_lost_its_entry(settings: Settings) -> None:
+    """Otherwise it works unseen, `/readyz` reports that there are no workers, and no job is measured against its memory."""
+    connection, text = connect(settings.redis, decode=False), connect(settings.redis, decode=True)
+    queue = RedisQueue(connection, name=settings.queue)
+    worker = PliantWorker(
+        settings=settings, connection=connection, quick=connection, records=RedisRecords(text, prefix=settings.queue),
+        queue=queue, name="cut-off",
+    )  # fmt: skip
+    worker.register_birth()
+    worker.heartbeat()
+    assert queue.workers() == ["cut-off"]
+    connection.delete(worker.key)  # it expires while the worker is cut off for more than a minute
+    queue.clean_up()
+    assert queue.workers() == []
+    worker.heartbeat()
+    assert queue.workers() == ["cut-off"]
+    worker.register_death()
+    queue.clean_up()
+    for each in (connection, text):
+        each.close()

@@ -319,6 +319,15 @@ def test_deleting_a_job_removes_its_record_files_and_log(jobs: Jobs, submit, inp
     assert submit(idempotency_key="k", fingerprint="g").id != id, "the key is free again"
 
 
+def test_a_job_that_is_being_cancelled_is_not_to_be_cancelled_first(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    id = submit().id
+    attempt_id = jobs.records.get(id).attempt_id
+    jobs.records.update(id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker="me", now=jobs.clock()))
+    jobs.cancel(id)
+    with pytest.raises(NotAllowedNow, match=r"cannot be deleted now\. Delete it when it is cancelled\."):
+        jobs.delete(id)
+
+
 def test_a_new_job_with_the_id_of_one_being_deleted_keeps_its_files(
     jobs: Jobs,
     submit,  # type: ignore[no-untyped-def]

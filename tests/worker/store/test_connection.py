@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ssl
+
 import pytest
 import redis
 from pliant.worker.errors import InvalidSetting, StoreUnavailable
@@ -14,6 +16,7 @@ from pliant.worker.store.connection import check_server, connect, reachable
         (redis.AuthenticationError("WRONGPASS"), "it refuses the password"),
         (redis.ConnectionError("refused"), "ConnectionError"),
         (redis.TimeoutError("late"), "TimeoutError"),
+        (redis.InvalidResponse("HTTP/1.1 400"), "another program than Redis answers"),
         (redis.OutOfMemoryError("OOM"), "its memory limit is reached"),
         (redis.ResponseError("MISCONF cannot persist"), "MISCONF cannot persist"),
         (redis.ResponseError("LOADING the dataset"), "LOADING the dataset"),
@@ -24,12 +27,32 @@ def test_a_server_that_cannot_serve_is_unavailable(fault: redis.RedisError, reas
         raise fault
 
 
+def test_the_reason_is_that_of_the_system_without_the_address() -> None:
+    """For example a refused certificate, which was only called a ConnectionError."""
+    fault = redis.ConnectionError("Error 1 connecting to redis.internal:6379")
+    fault.__cause__ = ssl.SSLCertVerificationError(1, "certificate verify failed")
+    with (
+        pytest.raises(StoreUnavailable, match=r"^The job store is unavailable \(certificate verify failed\)"),
+        reachable(),
+    ):
+        raise fault
+
+
 def test_command_errors_pass_through_unchanged() -> None:
     with pytest.raises(redis.ResponseError, match="WRONGTYPE"), reachable():
         raise redis.ResponseError("WRONGTYPE of a key")
 
 
-@pytest.mark.parametrize("url", ["http://host", "redis://:pass/word@host", "redis://host:many"])
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://host",
+        "redis://:pass/word@host",
+        "redis://host:many",
+        "redis://host?unknown=1",
+        "rediss://host?ssl_cert_reqs=some",
+    ],
+)
 def test_a_malformed_url_is_an_invalid_setting_and_not_shown(url: str) -> None:
     for opened in (lambda: connect(url, decode=True), lambda: check_server(url)):
         with pytest.raises(InvalidSetting, match=r"^PLIANT_REDIS_URL: expected a URL redis://") as caught:

@@ -62,9 +62,11 @@ def test_processes_wait_for_the_server_and_its_address_is_named(monkeypatch: pyt
         port = unused.getsockname()[1]
         told: list[str] = []
         settings = Settings(redis_url=f"redis://:secret@127.0.0.1:{port}/2")
-        with pytest.raises(StoreUnavailable, match="ConnectionError"):
+        with pytest.raises(StoreUnavailable, match="Connection refused"):
             wait_for_store(settings, told.append, within=0.1)
-    expected = f"The job store at redis://127.0.0.1:{port} is unavailable (ConnectionError). Waiting until it answers."
+    expected = (
+        f"The job store at redis://127.0.0.1:{port} is unavailable (Connection refused). Waiting until it answers."
+    )
     assert told == [expected]
     answers = iter([StoreUnavailable(JOB_STORE, reason="late"), None])
 
