@@ -183,6 +183,9 @@ def test_arguments_of_clients_and_submissions_are_checked() -> None:
         Client("http://pliant.test", retries=3)  # type: ignore[arg-type]
     with pytest.raises(BadArgument, match="limit: expected at least 0 jobs, or None for all, got -1"):
         list(client.list(limit=-1))
+    for size in (0, 201):
+        with pytest.raises(BadArgument, match=f"page_size: expected 1 to 200 jobs, got {size}. Use limit"):
+            list(client.list(page_size=size))
     client.close()
     with pytest.raises(BadArgument, match="The client is closed"):
         client.limits()
