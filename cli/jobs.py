@@ -150,8 +150,8 @@ def result(
         list[str] | None,
         typer.Option(
             "--make",
-            help="First write this from the stored result: glb, ply, obj, usd, abc, mdd, mat or csv; may be repeated. "
-            "Only these files are downloaded then.",
+            help="First write this from the stored result: glb, ply, obj, usd, abc, mdd, mat or csv; several as "
+            "usd,mdd, or by repeating. Only these files are downloaded then.",
         ),
     ] = None,
     fps: Annotated[float | None, typer.Option("--fps", help="With --make: frames per second of the animation.")] = None,
@@ -168,7 +168,7 @@ def result(
     with ctx.obj.client(url, as_json=as_json) as client:
         found = find_job(client, job).id
         if make:
-            further = client.make_outputs(found, make, fps=fps, timeout=timeout)
+            further = client.make_outputs(found, ",".join(make), fps=fps, timeout=timeout)
             ctx.obj.following = found = further.id
             with progress_bar(line_every=LINE_EVERY) as bar:
                 done = further.wait(on_progress=bar.on_progress, load=False, timeout=timeout)

@@ -230,15 +230,11 @@ def _array(value: Any, name: str) -> NDArray[np.generic]:
         array = np.asarray(value)
     except (TypeError, ValueError):  # rows of several lengths, or an object that NumPy cannot convert
         array = np.asarray(None)
-    if array.dtype == object and not hasattr(value, "dtype"):
-        raise BadArgument(
-            f"{name}: expected an array of numbers or booleans, got {kind_of(value)}, which cannot be converted. "
-            "Pad ragged lists with NaN, and give files by their path."
-        )
     if array.dtype.kind not in "biuf":
+        got = f"dtype {array.dtype}" if hasattr(value, "dtype") else f"{kind_of(value)}, which cannot be converted"
         raise BadArgument(
-            f"{name}: expected an array of numbers or booleans, got dtype {array.dtype}. "
-            "Pad ragged lists with NaN and omit entries that are not arrays."
+            f"{name}: expected an array of numbers or booleans, got {got}. "
+            "Pad ragged lists with NaN, omit entries that are not arrays, and give files by their path."
         )
     return array
 

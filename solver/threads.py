@@ -15,8 +15,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from threading import Lock
+from typing import TYPE_CHECKING
 
 from pliant.solver.pulse import pulse
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 SMALLEST = 200_000
 """Minimum number of array elements per thread; with fewer, starting the thread costs more than it saves."""
@@ -74,6 +78,26 @@ def _unchanged() -> None:
     """Restore nothing."""
 
 
+def _release(libraries: ThreadpoolController) -> None:
+    """Let every thread set the number of threads: in threadpoolctl 3.8 only the first one to set it can."""
+    for library in libraries.lib_controllers:
+        if hasattr(library, "clear_controlling_thread"):
+            library.clear_controlling_thread(force=True)
+
+
+def _limit_to_one(libraries: ThreadpoolController) -> Callable[[], None]:
+    """Limit the libraries to one thread; return a function that restores their numbers of threads, from whichever thread calls it."""
+    _release(libraries)
+    limit = libraries.limit(limits=1)
+
+    def restore() -> None:
+        _release(libraries)
+        limit.restore_original_limits()
+        _release(libraries)
+
+    return restore
+
+
 class _SerialBlas:
     """Limits BLAS to one thread while at least one solve of the process runs, in whatever order they start and end."""
 
@@ -89,7 +113,7 @@ class _SerialBlas:
                 libraries = ThreadpoolController().select(user_api="blas")
                 # Where it is 1 already, it is not set: in a forked process with a memory limit, OpenBLAS does not return from that.
                 several = any(library["num_threads"] != 1 for library in libraries.info())
-                self._restore = libraries.limit(limits=1).restore_original_limits if several else _unchanged
+                self._restore = _limit_to_one(libraries) if several else _unchanged
             self._running += 1
 
     def leave(self) -> None:

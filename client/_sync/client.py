@@ -286,11 +286,15 @@ class Client(Connection):
         Raises
         ------
         BadArgument
-            There is no such status, or the limit is negative.
+            There is no such status, the limit is negative, or the page size is not from 1 to 200.
         """
         exchange, wanted = self._exchange(timeout), status_names(statuses)
         if limit is not None and limit < 0:
             raise BadArgument(f"limit: expected at least 0 jobs, or None for all, got {limit}.")
+        if not 1 <= page_size <= 200:
+            raise BadArgument(
+                f"page_size: expected 1 to 200 jobs, got {page_size}. Use limit for the number of jobs in all."
+            )
         left = math.inf if limit is None else limit
         cursor: str | None = ""
         while cursor is not None and left > 0:

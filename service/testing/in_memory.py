@@ -26,7 +26,8 @@ class InMemoryService(httpx.BaseTransport, httpx.AsyncBaseTransport):
     Parameters
     ----------
     reconstruct : Reconstruct or None
-        Replaces the solver; by default `flat`, which is instant. None runs the real solver.
+        Replaces the solver: called with the points (F, P, 2), NaN where hidden, and the job's `Options`; returns the shapes (F, P, 3). By
+        default `flat`, which is instant. None runs the real solver.
     steps : float
         Progress reports before a job ends, 20 ms apart; `math.inf` runs each job until it is cancelled.
     problem : Problem, optional

@@ -65,10 +65,11 @@ TAKEN = "Address already in use"
 
 
 def test_result_make_creates_and_downloads_further_outputs(run: Run, job: str, tmp_path: Path) -> None:
-    ran = run("result", job, "--make", "mdd", "--make", "csv", "--fps", "50", "-o", tmp_path / "more")
+    ran = run("result", job, "--make", "mdd,mat", "--make", "csv", "--fps", "50", "-o", tmp_path / "more")
     assert ran.exit_code == 0, ran.output
     assert {path.name for path in (tmp_path / "more").iterdir()} == {
         "shapes.mdd",
+        "shapes.mat",
         "metrics_frames.csv",
         "metrics_points.csv",
     }

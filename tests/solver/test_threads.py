@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -103,6 +104,33 @@ def test_blas_stays_in_one_thread_until_the_last_of_several_solves_ends() -> Non
         one.__enter__()
         other.__enter__()
         one.__exit__(None, None, None)
+        assert blas_threads() == {1}
+        other.__exit__(None, None, None)
+        assert blas_threads() == {2}
+
+
+def test_blas_has_one_thread_whichever_thread_of_the_program_solves_and_whichever_solved_before() -> None:
+    seen: list[set[int]] = []
+
+    def nested() -> None:
+        with serial_blas():
+            seen.append(blas_threads())
+        seen.append(blas_threads())
+
+    with threadpool_limits(limits=2, user_api="blas"):
+        nested()
+        with ThreadPoolExecutor(1) as pool:
+            pool.submit(nested).result()
+            nested()
+    assert seen == [{1}, {2}] * 3
+
+
+def test_blas_gets_its_threads_back_from_another_thread_than_that_which_limited_it() -> None:
+    with threadpool_limits(limits=2, user_api="blas"), ThreadPoolExecutor(1) as pool:
+        one, other = serial_blas(), serial_blas()
+        pool.submit(one.__enter__).result()
+        other.__enter__()
+        pool.submit(one.__exit__, None, None, None).result()
         assert blas_threads() == {1}
         other.__exit__(None, None, None)
         assert blas_threads() == {2}

@@ -128,7 +128,7 @@ def test_a_region_can_be_an_array_or_a_file(inside: object, tmp_path: Path) -> N
         (lambda here: checked_options(5), "options: expected a mapping .* got a value of type int"),
         (lambda here: tracks_file(object(), None, here), "tracks: expected an array of numbers or booleans, got a value of type object"),
         (lambda here: tracks_file([[1.0], [2.0, 3.0]], None, here), "got a value of type list, which cannot be converted. Pad ragged"),
-        (lambda here: tracks_file(b"x", None, here), "tracks: expected an array of numbers"),
+        (lambda here: tracks_file(b"x", None, here), "got a value of type bytes, which .* by their path"),
         (lambda here: mesh_part(object(), here), "mesh: expected an array of numbers or booleans, got a value of type object"),
         (
             lambda here: Inputs(tracks=None, film="nofilm.mp4").form(here, {}, None),
@@ -183,6 +183,9 @@ def test_arguments_of_clients_and_submissions_are_checked() -> None:
         Client("http://pliant.test", retries=3)  # type: ignore[arg-type]
     with pytest.raises(BadArgument, match="limit: expected at least 0 jobs, or None for all, got -1"):
         list(client.list(limit=-1))
+    for size in (0, 201):
+        with pytest.raises(BadArgument, match=f"page_size: expected 1 to 200 jobs, got {size}. Use limit"):
+            list(client.list(page_size=size))
     client.close()
     with pytest.raises(BadArgument, match="The client is closed"):
         client.limits()

@@ -153,6 +153,8 @@ FORMATS = (
             npz(traj_maps_e=np.moveaxis(pixels(POINTS), 3, 1)[None], visconf_maps_e=np.moveaxis(pixels(CONFIDENCE), 3, 1)[None]),
             recognised="AllTracker", visibility=np.where(SEEN, 0.875 * 0.75, 0)),
     Written("PIPs++", "`trajs_e (B, S, N, 2)`", npz(trajs_e=POINTS[None]), recognised="PIPs++", visibility=None),
+    Written("OpenCV, its frames stacked", "`tracks (F, P, 1, 2)`, `visibility (F, P, 1)` of 0 and 1",
+            npz(tracks=POINTS[:, :, None], visibility=SEEN[..., None].astype(np.uint8))),
     Written("DOT", "`tracks (B, T, N, 3)`: x, y, visibility", npz(tracks=DOT[None]), recognised="DOT", visibility=np.where(SEEN, 0.875, 0)),
     Written("DOT, fractions of the picture", "`tracks (B, T, N, 3)`: x / (W − 1), y / (H − 1), visibility; option `image_size`",
             npz(tracks=UNIT[None]), recognised="DOT", options={"image_size": "9x5"}, visibility=np.where(SEEN, 0.875, 0)),

@@ -24,10 +24,11 @@ class Flat:
 
 
 def flatten(name: str, array: NDArray[np.generic]) -> Flat:
-    """Remove a batch axis of length 1, and flatten the pixels of pictures.
+    """Remove an axis of length 1, and flatten the pixels of pictures.
 
     Pictures are `(F, H, W, 2 or 3)` or `(F, 2, H, W)`, with or without a batch axis. Four axes with a first axis longer than 1 are
-    pictures if the first frame's x increases along the columns and y along the rows; otherwise they are a batch.
+    pictures if the first frame's x increases along the columns and y along the rows, and the points of OpenCV if they are `(F, P, 1, 2)`;
+    otherwise they are a batch.
 
     Raises
     ------
@@ -41,6 +42,8 @@ def flatten(name: str, array: NDArray[np.generic]) -> Flat:
             return Flat(array[0])
         if _is_picture(array):
             return _pictures(array)
+        if array.shape[2:] == (1, 2):
+            return Flat(array[:, :, 0])
         return Flat(_single(array))
     if array.ndim > 5:
         raise InvalidInput(
