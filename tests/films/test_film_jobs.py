@@ -294,7 +294,9 @@ def test_films_are_told_apart_from_track_files_and_spreadsheets(film: Path, tmp_
         tmp_path / "list.mp4",
         tmp_path / "missing.mov",
         tmp_path / "a.avi",
+        tmp_path / "refused.mts",
     )
+    (tmp_path / "refused.mts").write_bytes(bytes(4) + b"G" + bytes(200))
     assert [path for path in given if not looks_like_film(path)] == []
     sheets = {
         "a.xlsx": ("[Content_Types].xml", "xl/workbook.xml", "xl/media/image1.png"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -18,11 +19,14 @@ import numpy as np
 import pytest
 from browsing import why_not
 from paging import DONE, seek, until
-from playwright.sync_api import Browser, Page, expect
+from PIL import Image
+from playwright.sync_api import Browser, Locator, Page, expect
 from pliant.tracking.contact_sheet import small_jpeg
 from pliant.worker.artifacts import build_report, write_artifacts
+from pliant.worker.artifacts.preview import write_preview
 from pliant.worker.films.frame_strip import packed
 from results import make_result
+from scipy.spatial.transform import Rotation
 
 pytestmark = [
     pytest.mark.chromium,
@@ -32,6 +36,9 @@ pytestmark = [
 POINT_NAMES = tuple(f"Lid {number} ü" for number in range(21 * 31))
 GREYS = (20, 50, 80, 110, 140, 170, 200)
 """Grey level of each film frame."""
+GREEN = (0, 255, 0)
+EDGE = 6
+"""Pixels at the edge of a pane that may show what is around it, or the outline of the focus."""
 AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 QUICK_LOOK = """const supports = DOMTokenList.prototype.supports;
 DOMTokenList.prototype.supports = function (word) { return word === "ar" || supports.call(this, word); };"""
@@ -140,6 +147,60 @@ def test_the_film_plays_in_step_beside_the_mesh(browser: Browser, viewed: str) -
             )
             assert [(one["id"], [node["html"][:200] for node in one["nodes"]][:3]) for one in found] == [], width
             assert page.evaluate("document.documentElement.scrollWidth") <= width
+    page.context.close()
+
+
+def off_centre_close_up() -> bytes:
+    """The preview of the sheet seen from nearby by turning cameras, left of the middle of the picture of 320×180 pixels."""
+    inputs, solution, _ = make_result(rows=21, columns=31, texture=True)
+    turned = Rotation.from_rotvec(np.linspace(-0.7, 0.7, len(GREYS))[:, None] * (0.2, 1, 0)).as_matrix()
+    camera = replace(
+        solution.camera, rotations=turned, scales=np.full(len(GREYS), 0.4), translations=np.full((len(GREYS), 2), (110.0, 100.0)),
+        focal=150.0, principal_point=np.array([159.5, 89.5]),
+    )  # fmt: skip
+    into = io.BytesIO()
+    solution = replace(solution, camera=camera)
+    tracks = replace(inputs.tracks, points=camera.project(solution.shapes))
+    write_preview(into, tracks=tracks, mesh=inputs.mesh, solution=solution, texture=inputs.texture)
+    return into.getvalue()
+
+
+def drawn_part(pane: Locator, *backgrounds: tuple[int, int, int]) -> np.ndarray:
+    """Return left, top, right and bottom of what is drawn in a pane over its backgrounds, and the pane's size, pixels."""
+    pixels = np.asarray(Image.open(io.BytesIO(pane.screenshot())).convert("RGB"), dtype=int)
+    pixels = pixels[EDGE:-EDGE, EDGE:-EDGE]
+    drawn = np.all([np.abs(pixels - background).max(axis=2) > 40 for background in backgrounds], axis=0)
+    rows, columns = np.nonzero(drawn)
+    return np.array([columns.min(), rows.min(), columns.max(), rows.max(), pixels.shape[1], pixels.shape[0]])
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_camera_shows_the_mesh_where_the_film_shows_the_object(browser: Browser, viewed: str, width: int) -> None:
+    page = visitor(browser)
+    page.set_viewport_size({"width": width, "height": 900})
+    preview = off_centre_close_up()
+    page.route("**/preview.bin", lambda route: route.fulfill(body=preview))
+    page.goto(viewed)
+    film = page.locator(".panes > .view").first.locator("canvas")
+    mesh = page.get_by_role("application", name=re.compile("^3-D view"))
+    page.get_by_role("checkbox", name="Mesh over it").check(timeout=DONE)
+    page.get_by_label("Colour", exact=True).select_option("plain")
+    plain = f"border: 0; border-radius: 0; background: rgb{GREEN}"
+    page.evaluate("(style) => document.querySelectorAll('.view').forEach((it) => { it.style.cssText = style; })", plain)
+    page.evaluate("document.querySelector('.corner').style.visibility = 'hidden'")
+    for frame in (0, 3, 6):
+        seek(page, frame)
+        grey = (GREYS[frame],) * 3
+
+        def apart(grey: tuple[int, int, int] = grey) -> float:
+            drawn = drawn_part(film, grey, GREEN), drawn_part(mesh, GREEN)
+            return float(np.abs(drawn[0] - drawn[1]).max())
+
+        until(lambda: apart() <= 2)
+    for _ in range(3):
+        mesh.press("ArrowRight")
+    expect(page.get_by_role("checkbox", name="Camera's view")).not_to_be_checked()
+    until(lambda: apart() > 10)
     page.context.close()
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import films
 import numpy as np
 import pytest
+from PIL import Image
 from pliant.tracking import FilmError, FilmLimits, open_film, track_film
 
 PICTURES = films.textured_pictures(8)
@@ -48,6 +49,11 @@ def zipped(**entries: bytes) -> Callable[[Path], object]:
 
 def pictures(path: Path) -> Path:
     return films.zip_of(path, {f"{i}.png": films.png(p) for i, p in enumerate(PICTURES)})
+
+
+def animation(path: Path, kind: str) -> None:
+    first, *others = (Image.fromarray(picture) for picture in PICTURES)
+    first.save(path, kind, save_all=True, append_images=others)
 
 
 def elsewhere(path: Path) -> None:
@@ -88,6 +94,10 @@ CASES: dict[str, Case] = {
         words="film: expected an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures, got frame.png, a single picture. Depth comes from motion: pass a film, or a zip or folder with all its pictures."),
     "a single WebP picture": Case(name="frame.webp", data=b"RIFF\x1a\0\0\0WEBPVP8L",
         words="film: expected an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures, got frame.webp, a single picture. Depth comes from motion: pass a film, or a zip or folder with all its pictures."),
+    "an animated WebP": Case(name="film.webp", data=lambda path: animation(path, "WEBP"),
+        words="film: expected an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures, got film.webp, an animated WebP or PNG. Convert it to an animated GIF or an mp4 film."),
+    "an animated PNG": Case(name="film.png", data=lambda path: animation(path, "PNG"),
+        words="film: expected an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures, got film.png, an animated WebP or PNG. Convert it to an animated GIF or an mp4 film."),
     "a file of thousands of boxes": Case(data=FTYP + films.box(b"free") * 30_000,
         words="film: expected an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures, got film.mp4 with over 20000 boxes. Convert it: ffmpeg -i FILM film.mp4"),
     "samples in another file": Case(name="film.mov", data=elsewhere,
@@ -103,7 +113,7 @@ CASES: dict[str, Case] = {
     "an avi without its header": Case(name="film.avi", data=b"RIFF\0\0\0\0AVI LIST",
         words="film: expected an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures, got film.avi without its header (avih). Copy it again."),
     "random bytes": Case(name="film.mkv", data=lambda path: path.write_bytes(film(path).read_bytes()[:64] + bytes(1000)),
-        words="film: expected a film with a picture that FFmpeg decodes, got film.mkv. It may be damaged, hold sound only, or use a rare codec. Convert it: ffmpeg -i FILM film.mp4"),
+        words="film: expected a film with a picture that FFmpeg decodes, got film.mkv. It may be damaged, hold sound only, or use a codec that OpenCV lacks, such as AV1. Convert it: ffmpeg -i FILM film.mp4"),
     "equal frames, as of an interlaced film": Case(name="film.mkv", data=lambda path: films.write_film(path, PICTURES[:1] * 5),
         words="film: expected frames that differ, got 5 equal frames in film.mkv. If it is not a still picture, it is interlaced. Convert it: ffmpeg -i FILM -vf yadif film.mp4"),
     "absurd pixels": Case(data=lambda path: films.patched(film(path), b"tkhd", 80, struct.pack(">I", 640 << 16)),

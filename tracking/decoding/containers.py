@@ -124,6 +124,12 @@ def _recognise_stream(stream: BinaryIO, name: str) -> Container:
             "playlist", f"{name}, a playlist or text that refers to other files",
             "Pass the film itself; other files and addresses are never opened.",
         )  # fmt: skip
+    if (head[8:16] == b"WEBPVP8X" and int.from_bytes(head[20:21]) & 2) or (
+        head.startswith(b"\x89PNG") and b"acTL" in head
+    ):
+        raise _refusal(
+            "unsupported_film", f"{name}, an animated WebP or PNG", "Convert it to an animated GIF or an mp4 film."
+        )
     if head.startswith(PICTURES) or (head[:4] == b"RIFF" and head[8:12] == b"WEBP"):
         raise _refusal(
             "unsupported_film", f"{name}, a single picture",

@@ -389,7 +389,7 @@ def _decode_video(path: Path, fps: float, start: int, stop: int | None, step: in
 def _undecodable(path: Path) -> FilmError:
     return FilmError(
         "undecodable_film", field="film", expected="a film with a picture that FFmpeg decodes", got=path.name,
-        hint="It may be damaged, hold sound only, or use a rare codec. Convert it: ffmpeg -i FILM film.mp4",
+        hint="It may be damaged, hold sound only, or use a codec that OpenCV lacks, such as AV1. Convert it: ffmpeg -i FILM film.mp4",
     )  # fmt: skip
 
 

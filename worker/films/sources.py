@@ -17,7 +17,11 @@ VERSION = 1
 _MARK, _FILM, _REGION = "film.json", "film", "region"
 """Members of a stored source: version and file names, the film, the mask picture."""
 
-SUFFIXES = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".m3u8", ".3gp")
+SUFFIXES = (
+    ".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".m3u8", ".3gp",
+    ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".flv", ".ogv", ".webp",
+)  # fmt: skip
+"""Names of films; those in the second row are refused, with advice for films."""
 
 
 @dataclass(frozen=True, slots=True)

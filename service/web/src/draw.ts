@@ -100,6 +100,7 @@ export class RegionDialog {
     canvas.addEventListener("pointermove", (event) => this.extend(event));
     canvas.addEventListener("pointerup", () => this.end());
     canvas.addEventListener("pointercancel", () => this.abandon());
+    canvas.addEventListener("dragstart", (event) => event.preventDefault()); // of selected text, which would cancel the stroke
     return canvas;
   }
 

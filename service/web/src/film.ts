@@ -3,7 +3,8 @@
 import { type Entry, type Member, listing, unpacked, unreadable } from "./peek";
 import type { Inspection } from "./types";
 
-const FILMS = /\.(mp4|m4v|mov|webm|mkv|avi|gif|3gp)$/i;
+/** Includes films that the service refuses, with advice for films. */
+const FILMS = /\.(mp4|m4v|mov|webm|mkv|avi|gif|3gp|ts|mts|m2ts|mpe?g|wmv|flv|ogv)$/i;
 const TRACKS = /\.(npz|npy|mat|csv|tsv|h5|json)$/i;
 const PICTURES: [RegExp, string][] = [
   [/\.png$/i, "image/png"],

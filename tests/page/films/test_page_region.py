@@ -62,6 +62,16 @@ def test_a_region_drawn_with_the_mouse_is_sent_with_the_film(
     assert corners.max(0) == pytest.approx([0.8 * WIDTH, 0.8 * HEIGHT], abs=2)
 
 
+def test_a_region_is_drawn_after_a_drag_from_outside_has_selected_text(filming: Page, films: dict[str, bytes]) -> None:
+    drop(filming, {"film.webm": films["film.webm"]})
+    filming.get_by_role("button", name="Draw a region").click()
+    drag(filming, (-0.1, -0.05), (0.5, 0.5), (1.1, 1.05))
+    assert filming.evaluate("String(getSelection())") != ""
+    drag(filming, (0.2, 0.2), (0.8, 0.2), (0.8, 0.8), (0.2, 0.8))
+    expect(filming.get_by_role("dialog").get_by_role("status")).to_contain_text("Lasso with")
+    filming.get_by_role("button", name="Cancel").click()
+
+
 def test_a_region_is_drawn_with_the_keyboard_only(
     filming: Page, url: str, films: dict[str, bytes], finished: str
 ) -> None:

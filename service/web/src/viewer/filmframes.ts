@@ -1,6 +1,7 @@
 // Reading film_frames.bin, the small pictures of every tracked frame of a film (worker/films/frame_strip.py).
 
 import { call, headers } from "../api";
+import type { Crop } from "./stage";
 
 const MAGIC = "PLIANTFF";
 const PREFIX = 16;
@@ -24,12 +25,9 @@ export class FilmFrames {
     private readonly header: Header,
   ) {}
 
-  get width(): number {
-    return this.header.width;
-  }
-
-  get height(): number {
-    return this.header.height;
+  /** The film's picture, in its pixels: the first one's centre is (0, 0). */
+  get frame(): Crop {
+    return { left: -0.5, top: -0.5, width: this.header.width, height: this.header.height };
   }
 
   get frames(): number {

@@ -4,24 +4,19 @@ import { edges } from "./body";
 import type { FilmFrames } from "./filmframes";
 import { type Preview, isHidden } from "./preview";
 import { scattered } from "./scattered";
+import type { Crop } from "./stage";
 
 /** Maximum number of points drawn over a film, so that the picture stays visible, and without one. */
 const MOST = { film: 500, plain: 3000 };
 const TAIL = 6;
-
-interface Frame {
-  left: number;
-  top: number;
-  width: number;
-  height: number;
-}
 
 export class FilmPane {
   readonly canvas = document.createElement("canvas");
   showsTracks = true;
   showsMesh = false;
   private readonly context = this.canvas.getContext("2d") as CanvasRenderingContext2D;
-  private readonly frame: Frame;
+  /** The part of the picture plane that the pane shows. */
+  readonly frame: Crop;
   private readonly some: number[];
   private wires: Uint32Array | null = null;
   private colours = { dots: "#b4482c", wire: "#ffffff", paper: "#ffffff" };
@@ -34,7 +29,7 @@ export class FilmPane {
     private readonly film: FilmFrames | null,
   ) {
     this.some = scattered(preview.points, film ? MOST.film : MOST.plain);
-    this.frame = film ? { left: -0.5, top: -0.5, width: film.width, height: film.height } : this.around();
+    this.frame = film?.frame ?? this.around();
     this.canvas.setAttribute("role", "img");
     this.canvas.setAttribute("aria-label", film ? "The film at the same moment, with its tracks" : "The tracks at the same moment");
     new ResizeObserver(() => this.draw()).observe(this.canvas);
@@ -131,7 +126,7 @@ export class FilmPane {
   }
 
   /** Return the bounding box of the tracks of all frames, with a margin. */
-  private around(): Frame {
+  private around(): Crop {
     const { preview } = this;
     const [low, high] = [[Infinity, Infinity], [-Infinity, -Infinity]] as [[number, number], [number, number]];
     for (let frame = 0; frame < preview.ready; frame += Math.max(1, Math.floor(preview.ready / 30))) {

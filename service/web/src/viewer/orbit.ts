@@ -26,6 +26,7 @@ export class Orbit {
     for (const end of ["pointerup", "pointercancel"] as const) canvas.addEventListener(end, (event) => this.fingers.delete(event.pointerId));
     canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("dragstart", (event) => event.preventDefault()); // of selected text
   }
 
   /** Rotate around the vertical axis and around the viewer's horizontal axis, in radians. */

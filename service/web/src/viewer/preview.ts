@@ -220,10 +220,17 @@ export class Preview {
     const [tx, ty] = this.facts(frame).translation;
     const across = (row: number): number => scale * (r[3 * row]! * x + r[3 * row + 1]! * y + r[3 * row + 2]! * z);
     const [u, v] = [across(0) + tx, across(1) + ty];
-    const { focal, principal_point: centre, y_axis: upright } = this.header;
-    if (!focal || !centre) return [u, v];
-    const nearer = 1 + ((upright === "up" ? -1 : 1) * across(2)) / focal;
-    return [centre[0] + (u - centre[0]) / nearer, centre[1] + (v - centre[1]) / nearer];
+    const centre = this.header.principal_point;
+    if (!this.header.focal || !centre) return [u, v];
+    const distance = this.distance(frame, x, y, z);
+    return [centre[0] + (u - centre[0]) / distance, centre[1] + (v - centre[1]) / distance];
+  }
+
+  /** Return a world point's distance from a frame's camera along its axis, relative to that of the world's origin; 1 without perspective. */
+  distance(frame: number, x: number, y: number, z: number): number {
+    const { rotation: r, scale } = this.camera(frame);
+    const { focal, y_axis: upright } = this.header;
+    return focal ? 1 + ((upright === "up" ? -1 : 1) * scale * (r[6]! * x + r[7]! * y + r[8]! * z)) / focal : 1;
   }
 
   /** Return a point's position in the world. */

@@ -1,6 +1,7 @@
 // The renderer and its camera: one view, or two side by side with the same camera.
 //
-// The camera is orthographic, like the scaled orthographic model of the solver. The view is drawn only when something has changed.
+// The camera is orthographic, like the scaled orthographic model of the solver; through the camera of a frame, the projection is that
+// of the result. The view is drawn only when something has changed.
 
 import { Group, Matrix4, type Object3D, OrthographicCamera, Quaternion, Scene, Vector3, Vector4, WebGLRenderer } from "three";
 import { Orbit } from "./orbit";
@@ -8,6 +9,14 @@ import type { Preview } from "./preview";
 
 /** Viewing directions, relative to the camera of the frame with the most visible points. */
 export type Side = "front" | "side" | "top";
+
+/** A part of the picture plane, in the tracks' unit. */
+export interface Crop {
+  left: number;
+  top: number;
+  width: number;
+  height: number;
+}
 
 /** Share of a view that the fitted mesh fills. */
 const FILLED = 0.9;
@@ -35,6 +44,8 @@ export class Stage {
   private divided = false;
   /** True until the user moves the camera: the mesh is fitted again when the size of the view changes. */
   private fitted = true;
+  /** What the current drawing shows through the camera of a frame; null: what the orbit shows. */
+  private seen: { frame: number; crop: Crop } | null = null;
 
   /** Throws if the browser does not support WebGL 2. */
   constructor(
@@ -100,7 +111,7 @@ export class Stage {
 
   /** Look from the camera of the frame with the most visible points, from its right or from above, and fit the mesh. */
   look(side: Side): void {
-    this.through(this.preview.camera(this.preview.clearest).rotation);
+    this.orbit.orientation.copy(this.front());
     const turned = { front: [0, 0], side: [Math.PI / 2, 0], top: [0, -Math.PI / 2] }[side] as [number, number];
     const about = (x: number, y: number, angle: number): Quaternion =>
       new Quaternion().setFromAxisAngle(new Vector3(x, y, 0), angle);
@@ -182,9 +193,10 @@ export class Stage {
     this.redraw();
   }
 
-  /** Look through the camera of a frame; `rotation` is camera from world, row by row. */
-  through(rotation: Float32Array): void {
-    this.orbit.orientation.copy(this.orientationOf(rotation));
+  /** Look through the camera of a frame, at a part of its picture or, without one, at the fitted mesh. Called by `onDraw`. */
+  through(frame: number, crop: Crop | null): void {
+    this.orbit.orientation.copy(this.orientationOf(this.preview.camera(frame).rotation));
+    this.seen = crop && { frame, crop };
   }
 
   /** The orientation of the camera of the frame with the most visible points. */
@@ -274,14 +286,43 @@ export class Stage {
   }
 
   private draw(): void {
+    this.seen = null;
     this.onDraw();
     Object.assign(this.camera, { near: 0, far: 40 * this.radius });
     this.orbit.apply(20 * this.radius);
     this.camera.updateMatrixWorld();
     this.views().forEach((view, index) => {
+      if (this.seen) this.project(view, this.seen);
       this.renderer.setViewport(view);
       this.renderer.setScissor(view);
       this.renderer.render(this.scenes[index] as Scene, this.camera);
     });
+  }
+
+  /** Project as the camera of a frame does, so that a part of its picture just fits into a view; `Preview.project` as a matrix. */
+  private project({ z: width, w: height }: Vector4, { frame, crop }: { frame: number; crop: Crop }): void {
+    const { focal, principal_point: centre } = this.preview.header;
+    const { rotation: r, scale } = this.preview.camera(frame);
+    const { translation } = this.preview.facts(frame);
+    const away = this.down ? scale : -scale;
+    const perspective = focal && centre ? away / focal : 0;
+    const unit = Math.max(crop.width / width, crop.height / height);
+    // Rows of the matrix from the data's axes to clip coordinates; the last one is 1 + distance / focal length.
+    const row = (axis: 0 | 1, middle: number, size: number): [number, number, number, number] => {
+      const bend = perspective * ((focal && centre ? centre[axis] : 0) - middle);
+      const at = (k: number): number => (size * (scale * (r[3 * axis + k] as number) + bend * (r[6 + k] as number)));
+      return [at(0), at(1), at(2), size * ((translation[axis] as number) - middle)];
+    };
+    const [x, y, z] = [r[6], r[7], r[8]] as unknown as [number, number, number];
+    const depth = (Math.sign(away) * (this.flipped ? -1 : 1)) / (20 * this.radius);
+    const matrix = new Matrix4().set(
+      ...row(0, crop.left + crop.width / 2, 2 / (unit * width)),
+      ...row(1, crop.top + crop.height / 2, (this.down ? -2 : 2) / (unit * height)),
+      ...[depth * x, depth * y, depth * z, 0] as const,
+      ...[perspective * x, perspective * y, perspective * z, 1] as const,
+    );
+    const sign = this.down ? -1 : 1;
+    const world = new Matrix4().makeScale(1, sign, this.flipped ? -sign : sign); // its own inverse
+    this.camera.projectionMatrix.copy(matrix.multiply(world).multiply(this.camera.matrixWorld));
   }
 }

@@ -51,10 +51,11 @@ export class TrackDots {
       const from = points * frame + point;
       const [u, v] = [this.residuals[2 * from] as number, this.residuals[2 * from + 1] as number];
       if (isHidden(u)) continue;
+      const away = back * this.preview.distance(frame, ...this.preview.place(frame, point));
       for (let axis = 0; axis < 3; axis += 1) {
         const on = (header.origin[axis] as number) + header.step * (positions[3 * from + axis] as number);
-        // An image offset (u, v) is u·(first row) + v·(second row) of the camera in the world, over the scale.
-        const seen = on + back * (u * (r[axis] as number) + v * (r[3 + axis] as number));
+        // An image offset (u, v) is u·(first row) + v·(second row) of the camera in the world, over the scale, times the distance.
+        const seen = on + away * (u * (r[axis] as number) + v * (r[3 + axis] as number));
         this.ends[6 * shown + axis] = on;
         this.ends[6 * shown + 3 + axis] = seen;
         dots[3 * shown + axis] = seen;

@@ -259,13 +259,15 @@ export class Viewer {
 
   /** Update all objects to the current time; called before each drawing. */
   private place(): void {
-    const { time } = this.player;
+    const frame = Math.round(Math.min(this.player.time, this.preview.ready - 1));
+    // A camera belongs to one frame, as does the film's picture.
+    const time = this.following ? frame : this.player.time;
     this.body.show(time);
     this.truth?.show(time);
     this.dots?.show(time);
     this.probe.show(time);
     this.pane?.show(time);
-    if (this.following) this.stage.through(this.preview.camera(Math.round(Math.min(time, this.preview.ready - 1))).rotation);
+    if (this.following) this.stage.through(frame, this.film?.frame ?? this.pane?.frame ?? null);
     this.comparison.companion?.show(time, this.stage);
   }
 
