@@ -35,6 +35,10 @@ is weak evidence, which `confirmation` weighs."""
 DIP = 0.8
 """Minimum ratio of I to its running maximum with growing distance from the minimum: several minima are no evidence."""
 
+MAX_DEPTH_RATIO = 30.0
+"""Maximum ratio of the depths of the farthest and of the nearest point in a frame. Depths that differ by more keep any lengths constant,
+because they dominate them: without perspective, I has false minima there, with ratios of 60 to 600."""
+
 FOCAL_STEP = 1.5
 """Ratio of neighbouring focal lengths."""
 
@@ -168,17 +172,21 @@ def _golden(search: FocalSearch, middle: Tried) -> list[Tried]:
 
 
 def tried_at(search: FocalSearch, focal: float, near: Tried | None) -> Tried | None:
-    """Return the isometry at a focal length, started from the depths at `near` or, if that is None, from the conic program."""
+    """Return the isometry at a focal length, started from the depths at `near` or, if that is None, from the conic program.
+
+    None if the program has no solution, or if the surface is stretched along the viewing rays (`MAX_DEPTH_RATIO`).
+    """
     graph = search.graph(focal, search.frames)
     if near is None:
         depths = maximum_depth(graph, should_stop=search.should_stop)
     else:
         depths = _carried(near.found.depths, graph.seen, focal / near.focal)
-    return (
-        Tried(focal, refine_with_restarts(graph, depths, should_stop=search.should_stop))
-        if depths is not None
-        else None
-    )
+    if depths is None:
+        return None
+    found = refine_with_restarts(graph, depths, should_stop=search.should_stop)
+    nearest, farthest = np.where(graph.seen, found.depths, np.inf).min(axis=1), found.depths.max(axis=1)
+    stretched = near is not None and bool((farthest > MAX_DEPTH_RATIO * nearest).any())
+    return None if stretched else Tried(focal, found)
 
 
 def _carried(depths: Floats, seen: NDArray[np.bool_], ratio: float) -> Floats:

@@ -114,6 +114,15 @@ def test_weak_evidence_decides_only_against_a_free_surface_that_differs_and_is_n
     assert kept.choices.reasons["surface"].startswith("Solved as a free surface, whose verdict is good. The evidence")
 
 
+def test_surfaces_stretched_along_the_rays_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    search = search_of(rolled(frames=4, side=5).tracks)
+    first = tried_at(search, FOCAL, None)
+    assert first is not None
+    assert tried_at(search, 1.1 * FOCAL, first) is not None
+    monkeypatch.setattr("pliant.solver.isometry.focal_sweep.MAX_DEPTH_RATIO", 1.01)
+    assert tried_at(search, 1.1 * FOCAL, first) is None
+
+
 def test_fewer_than_two_frames_per_half_confirm_nothing() -> None:
     search = search_of(rolled(frames=4).tracks)
     chosen = tried_at(search, FOCAL, None)
