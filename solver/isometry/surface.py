@@ -31,12 +31,13 @@ ANCHORS = 60
 SOLVED_FRAMES = 24
 """Number of frames used in the conic program and to compare focal lengths; the others start from the most similar one of these."""
 
-SHEETLIKE = 0.17
-"""Distance of the frames from homographies of a reference frame, relative to the size, above which `auto` does not test isometry.
-Measured: sheets rolled up to half a cylinder .004 to .055, paper .028 and .040 with all errors, a comic page .042 and .052, made-up paper
-that the camera passes by 50° to 180° .02 to .11, and .14 to .16 where it goes all the way round; a back .027, heads .02 to .06, one that
-turns by 90° .13, other bodies .065 or more. Bodies below the limit are left to the tests that follow: with a limit of .2, none of those in
-`benchmarks.accuracy.kinds`, and of the recorded sequences seen from three half-sizes away, is taken as isometric."""
+SHEETLIKE, TESTED = 0.12, 0.17
+"""Distance of the frames from homographies of a reference frame, relative to the size, up to which tracks resemble those of a sheet, and
+up to which `auto` tests isometry. Measured: sheets rolled up to half a cylinder .004 to .055, paper .028 and .040 with all errors, a comic
+page .042 and .052, made-up paper that the camera passes by 50° to 180° .02 to .11, and .14 to .16 where it goes all the way round; a back
+.027, heads .02 to .06, one that turns by 90° .13, other bodies .065 or more. Bodies below the limit are left to the tests that follow: with a
+limit of .2, none of those in `benchmarks.accuracy.kinds`, and of the recorded sequences seen from three half-sizes away, is taken as
+isometric."""
 
 HOPELESS = 0.03
 """I of the subset `SMALL_PART` at the first focal length above which `auto` rejects isometry. Measured: paper and page at half to four
@@ -208,7 +209,7 @@ def _implausible(search: FocalSearch | None, focal: float, required: bool) -> st
     if required:
         return None
     off = off_homography(search.anchors.points, search.anchors.seen)
-    if off > SHEETLIKE:
+    if off > TESTED:
         return f"Isometry was not tested: the pictures differ from those of a plane by {off:.1%} of its size."
     changes = _glance(search, focal)
     return (
