@@ -80,6 +80,9 @@ class Stored(BaseModel):
     worker: str | None = None
     """Name of the worker that runs the job."""
 
+    stops: int = 0
+    """Attempts that ended because the installation was stopped or restored; they do not count against `Settings.max_attempts`."""
+
     key: str | None = None
     """Digest of owner and idempotency key."""
 

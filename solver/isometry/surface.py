@@ -35,8 +35,8 @@ SHEETLIKE, TESTED = 0.12, 0.17
 """Distance of the frames from homographies of a reference frame, relative to the size, up to which tracks resemble those of a sheet, and
 up to which `auto` tests isometry. Measured: sheets rolled up to half a cylinder .004 to .055, paper .028 and .040 with all errors, a comic
 page .042 and .052, made-up paper that the camera passes by 50° to 180° .02 to .11, and .14 to .16 where it goes all the way round; a back
-.027, heads .02 to .06, one that turns by 90° .13, other bodies .065 or more. Bodies below the limit are left to the tests that follow: with a
-limit of .2, none of those in `benchmarks.accuracy.kinds`, and of the recorded sequences seen from three half-sizes away, is taken as
+.027, heads .02 to .06, one that turns by 90° .13, other bodies .065 or more. Bodies below the limit are left to the tests that follow:
+with a limit of .2, none of those in `benchmarks.accuracy.kinds`, and of the recorded sequences seen from three half-sizes away, is taken as
 isometric."""
 
 HOPELESS = 0.03

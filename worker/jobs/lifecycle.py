@@ -159,7 +159,9 @@ def requeue(
     max_attempts: int | None,
     retention: float,
 ) -> Stored:
-    """Requeue a job that lost its worker, as attempt `fresh`; after `max_attempts` (None: no limit) it fails with `problem`.
+    """Requeue a job that lost its worker, as attempt `fresh`; after `max_attempts` it fails with `problem`.
+
+    `max_attempts` is None for a stop of the installation, which does not count.
 
     Raises
     ------
@@ -167,11 +169,12 @@ def requeue(
         The job belongs to another attempt, or is finished.
     """
     _check_owner(stored, attempt_id)
-    spent = max_attempts is not None and stored.job.attempt >= max_attempts
+    spent = max_attempts is not None and stored.job.attempt - stored.stops >= max_attempts
     if spent or stored.job.status is Status.CANCELLING:
         return fail(stored, attempt_id=attempt_id, problem=problem, now=now, retention=retention)
     job = stored.job.model_copy(update={"status": Status.QUEUED, "started_at": None, "progress": None})
-    return stored.model_copy(update={"job": job, "attempt_id": fresh, "worker": None})
+    stops = stored.stops + (max_attempts is None)
+    return stored.model_copy(update={"job": job, "attempt_id": fresh, "worker": None, "stops": stops})
 
 
 def redeliver(stored: Stored, *, attempt_id: str, fresh: str) -> Stored:

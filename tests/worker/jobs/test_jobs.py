@@ -261,6 +261,16 @@ def test_a_job_fails_after_losing_too_many_workers(jobs: Jobs, submit) -> None: 
     assert after.job.expires_at == NOW + timedelta(seconds=60)
 
 
+def test_stops_of_the_installation_do_not_count_as_lost_workers(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    id = submit().id
+    for attempt, most in enumerate((None, None, None, 2, 2)):
+        held = claim(jobs, id)
+        assert held.job.attempt == attempt + 1
+        again = partial(lifecycle.requeue, fresh=f"t{attempt}", problem=PROBLEM, now=NOW, retention=0)
+        after = jobs.records.update(id, partial(again, attempt_id=held.attempt_id, max_attempts=most))
+        assert after.job.status is (Status.QUEUED if attempt < 4 else Status.FAILED)
+
+
 def test_unfinished_jobs_can_be_cancelled_and_finished_ones_cannot(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
     queued, running, done = submit(), submit(), submit()
     assert jobs.cancel(queued.id).status is Status.CANCELLED
