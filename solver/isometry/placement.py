@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.inextensible import Indices
+from pliant.solver.isometry.refinement import MOST_DAMPED
 from pliant.solver.limits import CHUNK_OBSERVATIONS
 from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats
@@ -28,9 +29,6 @@ LENIENT = 3.0
 
 ITERATIONS, SETTLED = 20, 1e-3
 """Maximum number of Gauss–Newton steps per point, and the step, in standard deviations of the template, below which a point stays."""
-
-MOST_DAMPED = 1e4
-"""Maximum damping relative to the diagonal; a point that no step with less moves nearer stays."""
 
 
 def spline(source: Floats, values: Floats, target: Floats) -> Floats:

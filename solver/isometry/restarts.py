@@ -23,6 +23,7 @@ from pliant.solver.isometry.refinement import (
     typical,
     weights_of,
 )  # fmt: skip
+from pliant.solver.limits import CHUNK_OBSERVATIONS
 from pliant.solver.pulse import ShouldStop, never, pulse
 from pliant.solver.records import Floats
 from scipy import sparse
@@ -37,9 +38,6 @@ FRAME_ITERATIONS = 30
 
 MAX_STEP = 1.0
 """Maximum change of a log depth in a step; longer steps lead to depths that cannot be represented."""
-
-FRAMES_TOGETHER = 256
-"""Frames whose similarity to all others is computed at once."""
 
 
 def refine_with_restarts(graph: SurfaceGraph, depths: Floats, *, should_stop: ShouldStop = never) -> Isometry:
@@ -150,9 +148,10 @@ def _costs(graph: SurfaceGraph, left: Floats, ease: float) -> Floats:
 def similar_frames(graph: SurfaceGraph, count: int) -> Indices:
     """Return the most similar other frames of every frame, the most similar first, shape `(F, count)`, fewer columns in short sequences."""
     frames = len(graph.seen)
+    together = max(1, CHUNK_OBSERVATIONS // frames)
     found = [
         np.argsort(unlikeness(graph, some, itself=False), axis=1, kind="stable")[:, : min(count, frames - 1)]
-        for some in np.split(np.arange(frames), range(FRAMES_TOGETHER, frames, FRAMES_TOGETHER))
+        for some in np.split(np.arange(frames), range(together, frames, together))
     ]
     return np.concatenate(found)
 

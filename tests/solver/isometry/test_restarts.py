@@ -134,7 +134,7 @@ def test_similar_frames_exclude_the_frame_itself(frames: int, monkeypatch: pytes
     found = similar_frames(graph, SIMILAR_FRAMES)
     assert found.shape == (frames, min(SIMILAR_FRAMES, frames - 1))
     assert (found != np.arange(frames)[:, None]).all()
-    monkeypatch.setattr("pliant.solver.isometry.restarts.FRAMES_TOGETHER", 2)
+    monkeypatch.setattr("pliant.solver.isometry.restarts.CHUNK_OBSERVATIONS", 2 * frames)
     np.testing.assert_array_equal(similar_frames(graph, SIMILAR_FRAMES), found)
 
 
