@@ -16,11 +16,9 @@ from pliant.solver.isometry.refinement import (
     Isometry,
     blocks_of,
     ease_of,
-    edge_lengths,
     losses_of,
     refine,
     residuals,
-    typical,
     weights_of,
 )  # fmt: skip
 from pliant.solver.limits import CHUNK_OBSERVATIONS
@@ -57,18 +55,7 @@ def refine_with_restarts(graph: SurfaceGraph, depths: Floats, *, should_stop: Sh
     if restarted is None:
         return found
     again = refine(graph, restarted, should_stop=should_stop)
-    return again if _change(graph, again) < _change(graph, found) else found
-
-
-def _change(graph: SurfaceGraph, found: Isometry) -> float:
-    """Return the median over all edges and frames of |L_fe / l_e − 1|.
-
-    The inconsistency I is not compared here: an anchor that moves far away has long edges, which dominate its sums.
-    """
-    lengths = edge_lengths(graph, found.depths)
-    middle = typical(lengths)
-    used = np.isfinite(lengths) & (middle > 0)
-    return float(np.median(np.abs(lengths / np.where(middle > 0, middle, 1.0) - 1)[used]))
+    return again if again.inconsistency < found.inconsistency else found
 
 
 def _restarted(graph: SurfaceGraph, found: Isometry, should_stop: ShouldStop) -> Floats | None:
