@@ -34,10 +34,10 @@ def disagreement(search: FocalSearch, chosen: Tried) -> float:
 
     The larger one of the two halves; infinite if a half has fewer than two frames or no solution.
     """
-    frames = np.sort(search.frames)
+    order = np.argsort(search.frames)
     found: list[float] = []
-    for half in (frames[::2], frames[1::2]):
-        graph = search.graph(chosen.focal, half)
+    for half in (order[::2], order[1::2]):
+        graph = chosen.graph.of(half)
         depths = maximum_depth(graph, should_stop=search.should_stop) if len(half) >= 2 else None
         if depths is None:
             return np.inf

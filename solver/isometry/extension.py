@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.inextensible import Indices
-from pliant.solver.isometry.placement import TemplateMap, places_of, spline
+from pliant.solver.isometry.placement import TemplateMap, places_of
+from pliant.solver.isometry.splines import spline
 from pliant.solver.model.so3 import nearest
 from pliant.solver.records import Floats
 from pliant.solver.tracks.noise import RAYLEIGH_MEDIAN

@@ -7,13 +7,14 @@ neighbouring one, the first from the conic program.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.anchors import Anchors
+from pliant.solver.isometry.bows import bows_of
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
-from pliant.solver.isometry.refinement import Isometry
+from pliant.solver.isometry.refinement import Isometry, refine
 from pliant.solver.isometry.restarts import refine_with_restarts
 from pliant.solver.pulse import ShouldStop
 from pliant.solver.records import Floats
@@ -69,6 +70,13 @@ class FocalSearch:
 
     should_stop: ShouldStop
 
+    bows: Floats | None = None
+    """`SurfaceGraph.bows` of `frames`, the same for all focal lengths; None if unknown."""
+
+    def solved(self, focal: float) -> SurfaceGraph:
+        """Return the rays and edges of `frames` at a focal length."""
+        return replace(self.graph(focal, self.frames), bows=self.bows)
+
     def graph(self, focal: float, frames: NDArray[np.intp] | slice = slice(None)) -> SurfaceGraph:
         """Return the rays and edges of the given frames at a focal length."""
         rays = (self.anchors.points[frames] - self.centre) / focal
@@ -81,6 +89,10 @@ class Tried:
     """A focal length and the isometry found with it."""
 
     focal: float
+
+    graph: SurfaceGraph
+    """Rays and edges of the `frames` of the search at this focal length."""
+
     found: Isometry
 
 
@@ -106,11 +118,26 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
             break
         tried += further
     if not given and _may_be_accepted(tried):
+        search, tried = _along_surface(search, tried)
         tried += _golden(search, least_of(tried))
         tried += _beside(
             search, tried, least_of(tried)
         )  # the new minimum may lack a neighbour at the distance of a step
     return tried
+
+
+def _along_surface(search: FocalSearch, tried: list[Tried]) -> tuple[FocalSearch, list[Tried]]:
+    """Return the search and the isometries tried, with lengths along the surface that has the least I.
+
+    All focal lengths share them: their own would make a surface that is stretched along the viewing rays consistent.
+    """
+    least = least_of(tried)
+    search = replace(search, bows=bows_of(least.graph, least.found))
+    graphs = [search.solved(each.focal) for each in tried]
+    return search, [
+        Tried(each.focal, graph, refine(graph, each.found.depths, should_stop=search.should_stop))
+        for each, graph in zip(tried, graphs, strict=True)
+    ]
 
 
 def _may_be_accepted(tried: list[Tried]) -> bool:
@@ -177,7 +204,7 @@ def tried_at(search: FocalSearch, focal: float, near: Tried | None) -> Tried | N
 
     None if the program has no solution, or if the surface is stretched along the viewing rays (`MAX_DEPTH_RATIO`).
     """
-    graph = search.graph(focal, search.frames)
+    graph = search.solved(focal)
     if near is None:
         depths = maximum_depth(graph, should_stop=search.should_stop)
     else:
@@ -187,7 +214,7 @@ def tried_at(search: FocalSearch, focal: float, near: Tried | None) -> Tried | N
     found = refine_with_restarts(graph, depths, should_stop=search.should_stop)
     nearest, farthest = np.where(graph.seen, found.depths, np.inf).min(axis=1), found.depths.max(axis=1)
     stretched = near is not None and bool((farthest > MAX_DEPTH_RATIO * nearest).any())
-    return None if stretched else Tried(focal, found)
+    return None if stretched else Tried(focal, graph, found)
 
 
 def _carried(depths: Floats, seen: NDArray[np.bool_], ratio: float) -> Floats:

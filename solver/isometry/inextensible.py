@@ -11,7 +11,7 @@ starting point nor a template. Hidden observations have no variables and no cone
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,14 @@ class SurfaceGraph:
 
     edges: Indices
     """Pairs of neighbours, shape `(E, 2)`."""
+
+    bows: Floats | None = None
+    """Lengths of the edges along the surface relative to the distances of their ends, shape `(F, E)`; None if unknown, taken as 1."""
+
+    def of(self, frames: Indices) -> SurfaceGraph:
+        """Return the graph of these frames."""
+        bows = None if self.bows is None else self.bows[frames]
+        return replace(self, rays=self.rays[frames], confidence=self.confidence[frames], bows=bows)
 
     @property
     def seen(self) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Thin-plate splines over the template of a surface, and the positions of points on it.
+"""Positions of points on the template of a surface.
 
 In every frame, splines through the anchors map the template to space, and the camera maps space to the image. A point's position on the
 template is where its images are nearest to its tracks. The way back, from the image to the template, is not a function: a sheet that is
@@ -13,13 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.inextensible import Indices
 from pliant.solver.isometry.refinement import MOST_DAMPED
+from pliant.solver.isometry.splines import spline_basis, spline_coefficients, spline_slopes
 from pliant.solver.limits import CHUNK_OBSERVATIONS
 from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats
 from pliant.solver.tracks.noise import RAYLEIGH_MEDIAN
-
-STIFF = 1e-3
-"""Smoothing of the splines, in units of the template's squared standard deviation; needed because the anchors' depths are not exact."""
 
 STARTS = 8
 """Anchors whose images are nearest to the tracks of a point, of which the one with the least loss is the start."""
@@ -29,42 +27,6 @@ LENIENT = 3.0
 
 ITERATIONS, SETTLED = 20, 1e-3
 """Maximum number of Gauss–Newton steps per point, and the step, in standard deviations of the template, below which a point stays."""
-
-
-def spline(source: Floats, values: Floats, target: Floats) -> Floats:
-    """Return the smoothing thin-plate spline of `values (N, k)` at `source (N, 2)`, evaluated at `target (M, 2)`."""
-    return np.asarray(_basis(target, source) @ _coefficients(source, values))
-
-
-def _coefficients(source: Floats, values: Floats) -> Floats:
-    """Return the coefficients of a smoothing spline, shape `(N + 3, k)`: of the points, then of 1, x and y."""
-    count = len(source)
-    affine = np.concatenate([np.ones((count, 1)), source], axis=1)
-    matrix = np.zeros((count + 3, count + 3))
-    matrix[:count, :count] = _kernel(source, source) + STIFF * np.eye(count)
-    matrix[:count, count:], matrix[count:, :count] = affine, affine.T
-    matrix[count:, count:] = -1e-9 * np.eye(3)  # collinear sources do not determine the affine part
-    return np.linalg.solve(matrix, np.concatenate([values, np.zeros((3, values.shape[1]))]))
-
-
-def _basis(target: Floats, source: Floats) -> Floats:
-    """Return the values at `target (M, 2)` that the coefficients multiply, shape `(M, N + 3)`."""
-    return np.concatenate([_kernel(target, source), np.ones((len(target), 1)), target], axis=1)
-
-
-def _slopes(target: Floats, source: Floats) -> Floats:
-    """Return the derivatives of `_basis` by x and y, shape `(2, M, N + 3)`."""
-    apart = target[:, None] - source
-    square = np.maximum(np.square(apart).sum(axis=2), np.finfo(np.float64).tiny)
-    inner = (1 + np.log(square)) * apart.transpose(2, 0, 1)
-    affine = np.broadcast_to(np.eye(3)[1:, None], (2, len(target), 3))
-    return np.concatenate([inner, affine], axis=2)
-
-
-def _kernel(target: Floats, source: Floats) -> Floats:
-    """Return r² log r between all pairs."""
-    square = np.square(target[:, None, 0] - source[:, 0]) + np.square(target[:, None, 1] - source[:, 1])
-    return np.asarray(0.5 * square * np.log(np.maximum(square, np.finfo(np.float64).tiny)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,12 +52,12 @@ class TemplateMap:
     def of(cls, template: Floats, anchors: Floats, focal: float, centre: Floats) -> TemplateMap:
         """Return the map through anchors `(F, A, 3)`, camera axes."""
         flat = anchors.transpose(1, 0, 2).reshape(len(template), -1)
-        coefficients = _coefficients(template, flat).reshape(-1, len(anchors), 3)
+        coefficients = spline_coefficients(template, flat).reshape(-1, len(anchors), 3)
         return cls(template, coefficients, focal, centre, 1e-3 * float(np.median(anchors[..., 2])))
 
     def space(self, places: Floats) -> Floats:
         """Return the positions in camera axes, `(F, M, 3)`, of template positions `(M, 2)`."""
-        flat = _basis(places, self.template) @ self.coefficients.reshape(len(self.coefficients), -1)
+        flat = spline_basis(places, self.template) @ self.coefficients.reshape(len(self.coefficients), -1)
         found = flat.reshape(len(places), -1, 3).transpose(1, 0, 2).copy()
         found[..., 2] = np.maximum(found[..., 2], self.nearest)
         return found
@@ -107,7 +69,7 @@ class TemplateMap:
     def moved_image(self, places: Floats) -> tuple[Floats, Floats]:
         """Return the images `(F, M, 2)` of template positions `(M, 2)`, and their derivatives `(2, F, M, 2)` by both coordinates."""
         space, flat = self.space(places), self.coefficients.reshape(len(self.coefficients), -1)
-        slopes = (_slopes(places, self.template) @ flat).reshape(2, len(places), -1, 3).transpose(0, 2, 1, 3)
+        slopes = (spline_slopes(places, self.template) @ flat).reshape(2, len(places), -1, 3).transpose(0, 2, 1, 3)
         along = self.focal * (slopes[..., :2] - space[..., :2] / space[..., 2:] * slopes[..., 2:]) / space[..., 2:]
         return self.image(space), along
 

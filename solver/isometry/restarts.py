@@ -72,7 +72,7 @@ def _restarted(graph: SurfaceGraph, found: Isometry, should_stop: ShouldStop) ->
             break
         choice = open_starts[frames].argmax(axis=1)
         untried[frames, choice] = False
-        part = SurfaceGraph(graph.rays[frames], graph.confidence[frames], graph.edges)
+        part = graph.of(frames)
         begun = carried(depths[similar[frames, choice]], part)
         after, lower = refine_frames(part, begun, found.lengths, ease)
         better = lower < BETTER * costs[frames]

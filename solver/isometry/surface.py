@@ -9,17 +9,18 @@ lengths, and if halves of the frames lead to the same edge lengths (`confirmatio
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.anchors import choose_anchors, connected, nearest_neighbours, unlike_frames
+from pliant.solver.isometry.bows import refine_along_surface
 from pliant.solver.isometry.confirmation import DECISIVE, DISAGREEMENT, deformation, disagreement
 from pliant.solver.isometry.extension import MIN_ANCHORS, Extended, complete_anchors, extend, flatten
 from pliant.solver.isometry.focal_sweep import CLEAR, FocalSearch, Judgement, Tried, judged, least_of, sweep
 from pliant.solver.isometry.homographies import off_homography
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
-from pliant.solver.isometry.refinement import Isometry, edge_lengths, inconsistency, refine, typical
+from pliant.solver.isometry.refinement import refine
 from pliant.solver.isometry.restarts import carried, refine_with_restarts, unlikeness
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, Tracks
@@ -48,10 +49,6 @@ SMALL_PART = (30, 12, 10)
 
 TYPICAL_FOCAL = 0.8
 """First focal length tried, in image diagonals: a diagonal angle of view of about 64°."""
-
-LAST_NEIGHBOURS = 8
-"""Number of neighbours in the last refinement, fewer than `NEIGHBOURS`. Measured errors before → after it: a cylinder rolled ever tighter
-.015 → .007, a cone .084 → .054, paper .0187 → .0179; 5 neighbours give no further gain."""
 
 DIAGONAL_MARGIN = 1.3
 """Ratio of the image diagonal to the diagonal of the tracks' bounding box, assumed if the image size is not given."""
@@ -287,19 +284,14 @@ def _glance(search: FocalSearch, focal: float) -> float:
 
 def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried) -> IsometricSurface | None:
     """Return the surface in all frames and points at the chosen focal length, or None if the anchors are not connected."""
-    part = search.graph(chosen.focal, search.frames)
+    part = chosen.graph
     whole = search.graph(chosen.focal)
     afresh = maximum_depth(part, should_stop=search.should_stop)
     found = chosen.found if afresh is None else refine_with_restarts(part, afresh, should_stop=search.should_stop)
     found = min(found, chosen.found, key=lambda each: each.inconsistency)
     if len(search.frames) < tracks.num_frames:
         found = refine_with_restarts(whole, _from_similar(whole, search, found.depths), should_stop=search.should_stop)
-    if not search.should_stop():
-        # Short edges only: the chord of a long one is shorter than the surface between its ends.
-        near = replace(whole, edges=nearest_neighbours(search.anchors.points, search.seen, neighbours=LAST_NEIGHBOURS))
-        depths = refine_with_restarts(near, found.depths, should_stop=search.should_stop).depths
-        lengths = edge_lengths(whole, depths)
-        found = Isometry(depths, typical(lengths), inconsistency(lengths))
+    found = refine_along_surface(whole, found, should_stop=search.should_stop)
     template = flatten(search.edges, found.lengths, search.seen.shape[1])
     if template is None:
         return None

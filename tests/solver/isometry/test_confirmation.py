@@ -42,7 +42,7 @@ def test_wrong_depths_that_preserve_lengths_are_detected() -> None:
     first = tried_at(search, focal, None)
     assert first is not None
     stretched = np.square(first.found.depths / first.found.depths.max())
-    chosen = Tried(focal, refine(search.graph(focal, search.frames), stretched, iterations=60))
+    chosen = Tried(focal, first.graph, refine(first.graph, stretched, iterations=60))
     assert chosen.found.inconsistency < 0.002  # as small as that of a real sheet
     assert disagreement(search, chosen) > 10 * DISAGREEMENT
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pliant.solver.isometry.placement import TemplateMap, places_of, spline
+from pliant.solver.isometry.placement import TemplateMap, places_of
+from pliant.solver.isometry.splines import spline
 
 CENTRE = np.array([320.0, 240.0])
 

@@ -12,7 +12,7 @@ from pliant.solver.evaluation.metrics import reprojection
 from pliant.solver.evaluation.trust import per_frame
 from pliant.solver.isometry import focal_sweep
 from pliant.solver.isometry.anchors import Anchors, connected, nearest_neighbours
-from pliant.solver.isometry.extension import complete_anchors, extend, flatten, share_of_track, spline
+from pliant.solver.isometry.extension import complete_anchors, extend, flatten, share_of_track
 from pliant.solver.isometry.focal_sweep import FocalSearch, Tried
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import (
@@ -24,6 +24,7 @@ from pliant.solver.isometry.refinement import (
     residuals,
     typical,
 )
+from pliant.solver.isometry.splines import spline
 from pliant.solver.isometry.surface import IsometricSurface, isometric_surface
 from pliant.solver.model.so3 import exponential
 from pliant.solver.pulse import never
@@ -88,9 +89,10 @@ def with_inconsistencies(monkeypatch: pytest.MonkeyPatch, of_focal: Callable[[fl
 
     def tried_at(search: object, focal: float, near: object) -> Tried:
         focals.append(focal)
-        return Tried(focal, Isometry(np.ones((2, 3)), np.ones(3), of_focal(focal)))
+        return Tried(focal, SEARCH.graph(focal), Isometry(np.ones((2, 3)), np.ones(3), of_focal(focal)))
 
     monkeypatch.setattr(focal_sweep, "tried_at", tried_at)
+    monkeypatch.setattr(focal_sweep, "_along_surface", lambda search, tried: (search, tried))
     return focals
 
 
