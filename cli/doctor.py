@@ -304,10 +304,11 @@ def check_stored(settings: Settings) -> Iterator[Finding]:
         yield Finding(
             "stored", "bad", sentence, "Most mismatches are repaired within minutes; report those that remain."
         )
-    for name in Incoming(settings.incoming).abandoned():
+    abandoned = Incoming(settings.incoming).abandoned()
+    for name in abandoned:
         advice = "The next start of the service removes it."
         yield Finding("stored", "bad", f"Folder incoming/{name} belongs to a process that has ended.", advice)
-    if not found:
+    if not found and not abandoned:
         yield Finding("stored", "good", "the stores are consistent with the job records")
 
 
