@@ -367,6 +367,18 @@ def test_a_socket_directory_that_others_may_write_is_refused(tmp_path: Path) -> 
             directory.rmdir()
 
 
+def test_the_records_of_another_user_are_not_to_be_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As when the command is run with `sudo` alone: the socket's directory is that of the records."""
+    Valkey.claim(tmp_path).release()
+    own = os.getuid()
+    monkeypatch.setattr("os.getuid", lambda: own + 1)
+    with pytest.raises(
+        ServerFailed, match=r"belongs to another user\. Run the command as the user that runs Pliant"
+    ) as caught:
+        Valkey.claim(tmp_path)
+    assert "Remove" not in str(caught.value)
+
+
 def test_a_long_socket_path_does_not_follow_tmpdir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A command with another TMPDIR than the server's would not find it otherwise."""
     deep = tmp_path / "/".join(["deep"] * 30)
