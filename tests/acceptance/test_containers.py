@@ -112,6 +112,11 @@ def test_the_image_is_pinned_labelled_unprivileged_and_minimal() -> None:
     assert "USER 10001" in last
 
 
+def test_the_passwords_of_compose_reach_no_layer_of_the_build() -> None:
+    assert "\nCOPY . .\n" in DOCKERFILE
+    assert ".env" in (ROOT / ".dockerignore").read_text().splitlines()
+
+
 def test_with_tls_only_the_proxy_is_reachable() -> None:
     assert TLS["services"]["api"]["ports"] == []
     assert set(TLS["services"]) == {"api", "caddy"}
