@@ -122,6 +122,7 @@ class Retention:
         A submission without a record has no results. Those of an unknown job are of lost records, or of another installation.
         """
         oldest = self.jobs.clock() - ORPHAN_AGE
+        self.jobs.blobs.clear_unfinished(before=oldest)
         files = self.jobs.blobs.list("jobs/")
         with_results = {key.split("/")[1] for key, _ in files if "/artifacts/" in key}
         kept = set()

@@ -208,6 +208,16 @@ def test_files_that_belong_to_no_job_are_removed_once_old(
     assert sweep_at(datetime.now(UTC) + timedelta(hours=7)) == wanted
 
 
+def test_temporary_files_of_killed_processes_are_removed_with_the_stray_ones(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[datetime] = []
+    monkeypatch.setattr(Blobs, "clear_unfinished", lambda self, *, before: asked.append(before))
+    world.monotonic += 3600
+    world.pass_seconds(1)
+    assert asked == [world.now - timedelta(hours=6)]
+
+
 def test_results_without_a_record_are_kept_and_named(
     world: World, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
