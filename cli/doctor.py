@@ -335,7 +335,7 @@ def show(findings: list[Finding]) -> None:
 
 
 def check_blobs() -> Iterator[Finding]:
-    """Check the blob store of PLIANT_BLOB_URL by listing its contents."""
+    """Check the blob store of PLIANT_BLOB_URL by listing its contents, and by writing and removing a file."""
     url = settings_here().blob_url
     if url is None:
         return
@@ -343,7 +343,10 @@ def check_blobs() -> Iterator[Finding]:
     from pliant.worker.store.blobs import Blobs
 
     try:
-        Blobs.open(url).check()
+        blobs = Blobs.open(url)
+        blobs.check()
+        blobs.write(probe := f"doctor/{time.time_ns()}", b"")
+        blobs.delete(probe)
     except InvalidSetting as fault:
         yield Finding("blobs", "bad", str(fault), "Correct the address.")
     except StoreUnavailable as fault:
