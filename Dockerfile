@@ -29,5 +29,6 @@ HEALTHCHECK --interval=15s --timeout=5s --start-period=60s --retries=4 \
     CMD ["python", "-c", "import urllib.request; urllib.request.urlopen('http://127.0.0.1:8000/healthz', timeout=4)"]
 # Alone, the image is the whole service: API, workers and embedded Valkey in one container. It requires tokens, so create one first:
 #   docker run --rm -v pliant:/data pliant pliant token create me
-#   docker run -v pliant:/data -p 127.0.0.1:8000:8000 pliant
+#   docker run --stop-timeout 40 -v pliant:/data -p 127.0.0.1:8000:8000 pliant
+# Docker's own 10 s to stop would cut off running jobs, which have PLIANT_STOP_GRACE seconds before they return to the queue.
 CMD ["pliant", "up", "--host", "0.0.0.0", "--port", "8000"]

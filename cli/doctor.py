@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from pliant.cli.exits import Exit
 from pliant.cli.extras import missing_modules, require_server
-from pliant.cli.paths import installation
+from pliant.cli.paths import installation, readable_installation
 from pliant.cli.session import HOME, Json, Session, Url
 from pliant.cli.show import out, print_json
 from pliant.cli.up import Data, read_settings, unknown_variables
@@ -87,6 +87,7 @@ def fsck(ctx: typer.Context, data: Data = None, as_json: Json = False) -> None:
     require_server("pliant fsck")
     settings = read_settings(data, None)
     installation(settings)
+    readable_installation(settings)
     report(list(check_stored(settings)), as_json=as_json)
 
 
@@ -291,23 +292,30 @@ def check_service(session: Session, url: str) -> Iterator[Finding]:
 def check_stored(settings: Settings) -> Iterator[Finding]:
     """Compare records, queue, blobs, scratch directories, uploads and incomplete request bodies with each other."""
     from pliant.service.spool import Incoming
-    from pliant.worker.errors import StoreUnavailable
+    from pliant.worker.errors import JOB_STORE, StoreUnavailable
     from pliant.worker.jobs.service import Jobs
     from pliant.worker.maintenance.fsck import findings
 
     try:
         found = findings(Jobs.open(settings))
     except StoreUnavailable as fault:
-        yield Finding("stored", "bad", str(fault), "Start `pliant up` on this directory, then check again.")
+        embedded = settings.redis_url is None and fault.what == JOB_STORE
+        advice = (
+            "Start `pliant up` on this directory, then check again."
+            if embedded
+            else "`pliant doctor` checks the stores."
+        )
+        yield Finding("stored", "bad", str(fault), advice)
         return
     for sentence in found:
         yield Finding(
             "stored", "bad", sentence, "Most mismatches are repaired within minutes; report those that remain."
         )
-    for name in Incoming(settings.incoming).abandoned():
+    abandoned = Incoming(settings.incoming).abandoned()
+    for name in abandoned:
         advice = "The next start of the service removes it."
         yield Finding("stored", "bad", f"Folder incoming/{name} belongs to a process that has ended.", advice)
-    if not found:
+    if not found and not abandoned:
         yield Finding("stored", "good", "the stores are consistent with the job records")
 
 
@@ -327,7 +335,7 @@ def show(findings: list[Finding]) -> None:
 
 
 def check_blobs() -> Iterator[Finding]:
-    """Check the blob store of PLIANT_BLOB_URL by listing its contents."""
+    """Check the blob store of PLIANT_BLOB_URL by listing its contents, and by writing and removing a file."""
     url = settings_here().blob_url
     if url is None:
         return
@@ -335,7 +343,10 @@ def check_blobs() -> Iterator[Finding]:
     from pliant.worker.store.blobs import Blobs
 
     try:
-        Blobs.open(url).check()
+        blobs = Blobs.open(url)
+        blobs.check()
+        blobs.write(probe := f"doctor/{time.time_ns()}", b"")
+        blobs.delete(probe)
     except InvalidSetting as fault:
         yield Finding("blobs", "bad", str(fault), "Correct the address.")
     except StoreUnavailable as fault:

@@ -112,6 +112,25 @@ def installation(settings: Settings) -> None:
         )
 
 
+def readable_installation(settings: Settings) -> None:
+    """Check that this user can read the folders of the data directory: one that it cannot read would look empty.
+
+    Raises
+    ------
+    BadArgument
+        A folder belongs to another user.
+    """
+    from pliant.client.errors import BadArgument
+    from pliant.worker.paths import FOLDERS
+
+    for folder in (settings.data / name for name in FOLDERS):
+        if folder.exists() and not os.access(folder, os.R_OK | os.X_OK):
+            raise BadArgument(
+                f"--data: expected folders that this user can read, got {folder}, which it cannot. Run the command as the user that "
+                "runs Pliant, for example with `sudo -u pliant`."
+            )
+
+
 def output_file(
     path: Path | None, option: str, *, force: bool, suffixes: tuple[str, ...] = (), others: Iterable[Path | None] = ()
 ) -> None:

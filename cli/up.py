@@ -76,7 +76,7 @@ def up(
     ctx.obj.json = as_json
     require_server("pliant up")
     from pliant.service.settings import ServiceSettings
-    from pliant.worker.processes.preflight import check_settings
+    from pliant.worker.processes.preflight import check_settings, open_data_directory
     from pliant.worker.processes.supervisor import Supervisor, valkey_child, worker_children
     from pliant.worker.processes.valkey import Valkey
 
@@ -87,6 +87,7 @@ def up(
     port = free_port(host, service.port if port is None else port)
     url = address(host, port)
     make_folder(settings.data, "--data")
+    open_data_directory(settings)
     with ExitStack() as held:
         children: list[Child] = []
         if settings.redis_url is None:
@@ -119,13 +120,14 @@ def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json
     """Run only workers, for a service that uses the same PLIANT_REDIS_URL and PLIANT_BLOB_URL."""
     ctx.obj.json = as_json
     require_server("pliant work")
-    from pliant.worker.processes.preflight import check_settings
+    from pliant.worker.processes.preflight import check_settings, open_data_directory
     from pliant.worker.processes.supervisor import Supervisor, worker_children
 
     settings = read_settings(data, workers)
     show_warnings(unknown_variables())
     check_settings(settings)
     make_folder(settings.data, "--data")
+    open_data_directory(settings)
 
     def announce() -> None:
         if as_json:

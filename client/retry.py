@@ -179,7 +179,7 @@ class Attempts:
         if now + pause >= self.deadline:
             raise WaitTimeout(
                 f"The timeout of {self.timeout:g} s passed during {self.doing}; the last error was: "
-                f"{fault or type(fault).__name__}. {self._advice}"
+                f"{str(fault).removesuffix('.') or type(fault).__name__}. {self._advice}"
             ) from fault
         return pause
 

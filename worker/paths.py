@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 from pathlib import Path
@@ -17,6 +18,11 @@ def make_data_directory(data: Path) -> None:
     """Create the data directory and its folders, readable by their owner only, since they contain all inputs and results.
 
     An existing data directory keeps its mode; the folders inside it are closed to other users.
+
+    Raises
+    ------
+    OSError
+        A folder cannot be made, or belongs to another user.
     """
     data.mkdir(parents=True, exist_ok=True, mode=0o700)
     for name in FOLDERS:
@@ -24,6 +30,8 @@ def make_data_directory(data: Path) -> None:
         folder.mkdir(exist_ok=True, mode=0o700)
         if folder.stat().st_uid == os.getuid():
             folder.chmod(0o700)
+        if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(folder))
 
 
 def valkey_directory(data: Path) -> Path:

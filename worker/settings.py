@@ -96,7 +96,7 @@ class Settings:
     """Maximum number of running jobs per owner; further jobs wait. 0: no limit. Without tokens, all jobs have one owner."""
 
     retention: Seconds = 30 * 86400.0
-    """Time for which a finished job and its files are kept; 0: indefinitely."""
+    """Time for which a job that ends from now on is kept with its files; 0: indefinitely. Jobs that have ended keep their `expires_at`."""
 
     disk_quota: Bytes = 0
     """Maximum total bytes of jobs and uploads, above which new ones are rejected; 0: no quota. Results of accepted jobs are stored beyond

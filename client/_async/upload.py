@@ -14,7 +14,7 @@ import httpx
 from pliant.client import multipart
 from pliant.client._async.transport import Exchange, parse, refusal
 from pliant.client.call import Call
-from pliant.client.errors import APIStatusError, NotFound, PliantError
+from pliant.client.errors import APIStatusError, NotFound, PliantError, TooManyRequests
 from pliant.client.multipart import Form, Remainder, sha256
 from pliant.client.pauses import async_sleep, in_thread
 from pliant.client.retry import OUT_OF_STEP
@@ -54,8 +54,9 @@ async def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str,
     """
     attempts, size, reached = exchange.attempts, path.stat().st_size, 0
     encoded = base64.b64encode(bytes.fromhex(digest)).decode()
+    known: Upload | None = None
     while True:
-        held = await _state(exchange, upload_id)
+        held = known or await _state(exchange, upload_id)
         if held.complete:
             report(size)
             return
@@ -80,6 +81,8 @@ async def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str,
             await async_sleep(attempts.pause_after(fault))
         else:
             await exchange.pause_or_raise(call, fault)
+        # At a low rate limit, the request for the state would use up what was waited for.
+        known = held if isinstance(fault, TooManyRequests) else None
 
 
 async def delete_uploads(exchange: Exchange, form: Form) -> None:

@@ -15,7 +15,7 @@ import httpx
 from pliant.client import multipart
 from pliant.client._sync.transport import Exchange, parse, refusal
 from pliant.client.call import Call
-from pliant.client.errors import APIStatusError, NotFound, PliantError
+from pliant.client.errors import APIStatusError, NotFound, PliantError, TooManyRequests
 from pliant.client.multipart import Form, Remainder, sha256
 from pliant.client.pauses import in_place, sleep
 from pliant.client.retry import OUT_OF_STEP
@@ -55,8 +55,9 @@ def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str, repor
     """
     attempts, size, reached = exchange.attempts, path.stat().st_size, 0
     encoded = base64.b64encode(bytes.fromhex(digest)).decode()
+    known: Upload | None = None
     while True:
-        held = _state(exchange, upload_id)
+        held = known or _state(exchange, upload_id)
         if held.complete:
             report(size)
             return
@@ -81,6 +82,8 @@ def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str, repor
             sleep(attempts.pause_after(fault))
         else:
             exchange.pause_or_raise(call, fault)
+        # At a low rate limit, the request for the state would use up what was waited for.
+        known = held if isinstance(fault, TooManyRequests) else None
 
 
 def delete_uploads(exchange: Exchange, form: Form) -> None:

@@ -52,6 +52,7 @@ _LOG = {"text/plain": {"schema": {"type": "string"}}}
     response_class=StreamingResponse,
     responses={
         200: {"description": "Events until the job has ended.", "content": _STREAM},
+        204: {"description": "The job has ended, and no event follows `Last-Event-ID`: a browser's EventSource stops."},
         **problems(401, 404, 422, 503),
     },
 )
@@ -68,8 +69,10 @@ async def events(
     A comment line every 15 s keeps proxies from closing the connection. The stream also ends when the token expires or is revoked.
     """
     stream = core.followers.follow(jobs, id, after=last or None, heartbeat=core.settings.heartbeat_seconds)
-    # Refuse before the stream begins, while a status code can still report an error.
-    await to_thread.run_sync(partial(jobs.events, id, after=last or None))
+    # Refuse or end before the stream begins, while a status code can still tell it.
+    stored = await to_thread.run_sync(jobs.stored, id)  # before its events, which then include the last
+    if not await to_thread.run_sync(partial(jobs.events, id, after=last or None)) and stored.job.status.final:
+        return Response(status_code=204, headers={"Cache-Control": "no-store"})
     encoded = _encode(stream, still_valid=request.scope.get("pliant.still_valid"))
     return EventSourceResponse(
         iter(()) if request.method == "HEAD" else encoded,  # an answer without body need not last until the job ends

@@ -112,9 +112,17 @@ def test_the_image_is_pinned_labelled_unprivileged_and_minimal() -> None:
     assert "USER 10001" in last
 
 
+def test_the_passwords_of_compose_reach_no_layer_of_the_build() -> None:
+    assert "\nCOPY . .\n" in DOCKERFILE
+    assert ".env" in (ROOT / ".dockerignore").read_text().splitlines()
+
+
 def test_with_tls_only_the_proxy_is_reachable() -> None:
     assert TLS["services"]["api"]["ports"] == []
     assert set(TLS["services"]) == {"api", "caddy"}
+    hosts = TLS["services"]["api"]["environment"]["PLIANT_ALLOWED_HOSTS"]
+    assert hosts.startswith("${PLIANT_ALLOWED_HOSTS:-${PLIANT_DOMAIN:?"), "that of .env has effect"
+    assert hosts.endswith("},127.0.0.1,localhost}"), "commands in the container reach the API"
     assert "./deploy/Caddyfile:/etc/caddy/Caddyfile:ro" in TLS["services"]["caddy"]["volumes"]
     proxy = (ROOT / "deploy" / "Caddyfile").read_text()
     assert f"reverse_proxy api:{COMPOSE['services']['api']['environment']['PLIANT_PORT']} " in proxy

@@ -246,6 +246,7 @@ def test_fsck_compares_the_stores_with_the_records(tmp_path: Path) -> None:
         assert fsck() == (0, [("good", "the stores are consistent with the job records")])
         (data / "incoming" / "dead").mkdir(parents=True)
         (data / "incoming" / "dead.lock").touch()
+        assert fsck() == (8, [("bad", "Folder incoming/dead belongs to a process that has ended.")])
         (data / "uploads" / "somebody" / "half").mkdir(parents=True)
         code, findings = fsck()
         assert code == 8

@@ -26,7 +26,7 @@ from pliant.client import BadArgument, Unreachable
 from pliant.schemas.job import LONGEST_NAME
 from pliant.service.settings import ServiceSettings
 from pliant.service.testing import InMemoryService
-from pliant.worker.errors import ServerFailed
+from pliant.worker.errors import ServerFailed, StoreUnavailable
 from pliant.worker.processes.valkey import find_binary
 from pliant.worker.settings import NUMERICAL_THREADS, Settings
 from serving import free_port, until
@@ -277,6 +277,15 @@ def test_doctor_checks_the_blob_store(tmp_path: Path, monkeypatch: pytest.Monkey
     assert list(doctor.check_blobs()) == []
     monkeypatch.setenv("PLIANT_BLOB_URL", (tmp_path / "blobs").as_uri())
     assert verdicts(doctor.check_blobs()) == {"blobs": "good"}
+    assert list((tmp_path / "blobs").rglob("*")) == []
+    with monkeypatch.context() as refusing:  # as credentials that may list the bucket, but not write to it
+
+        def refused(*_: object) -> None:
+            raise StoreUnavailable("The blob store", reason="PermissionDeniedError")
+
+        refusing.setattr("pliant.worker.store.blobs.Blobs.write", refused)
+        (found,) = doctor.check_blobs()
+        assert (found.verdict, "cannot be used (PermissionDeniedError)" in found.found) == ("bad", True)
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("PLIANT_BLOB_URL", "bucket")
     (found,) = doctor.check_blobs()

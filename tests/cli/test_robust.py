@@ -386,6 +386,36 @@ def test_commands_reject_a_missing_installation_and_create_nothing(
     assert [each.name for each in tmp_path.rglob("*")] == ["empty"]
 
 
+@pytest.mark.parametrize("folder", ["blobs", "uploads"])
+def test_fsck_refuses_folders_that_this_user_cannot_read(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, folder: str
+) -> None:
+    """Without their right to read, it called the blob store unavailable, and took folders of uploads for empty."""
+    closed = tmp_path / folder
+    closed.mkdir()
+    monkeypatch.setattr("os.access", lambda path, mode: path != closed)
+    ran = run("fsck", "--data", str(tmp_path))
+    assert ran.exit_code == Exit.REFUSED
+    assert words(ran) == refusal(
+        f"--data: expected folders that this user can read, got {closed}, which it cannot. Run the command as the user that runs "
+        "Pliant, for example with `sudo -u pliant`."
+    )
+
+
+def test_fsck_points_to_the_doctor_if_a_server_does_not_answer(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def advice() -> str:
+        ran = run("fsck", "--data", str(tmp_path), "--json")
+        assert ran.exit_code == Exit.UNHEALTHY
+        return str(json.loads(ran.stdout)[0]["advice"])
+
+    (tmp_path / "valkey").mkdir()
+    assert advice() == "Start `pliant up` on this directory, then check again."
+    monkeypatch.setenv("PLIANT_REDIS_URL", "redis://127.0.0.1:9")
+    assert advice() == "`pliant doctor` checks the stores."
+
+
 def test_an_unknown_scope_is_refused_before_the_installation_is_opened(run: Run, tmp_path: Path) -> None:
     ran = run("token", "create", "ada", "--scope", "root", "--data", str(tmp_path / "data"))
     assert ran.exit_code == Exit.REFUSED

@@ -58,6 +58,17 @@ def test_more_workers_than_fit_into_the_memory_are_refused(
 
 
 @pytest.mark.parametrize("command", ["up", "work"])
+def test_a_folder_of_another_user_is_refused_before_processes_start(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str
+) -> None:
+    monkeypatch.setattr("os.access", lambda path, mode: path != tmp_path / "work")
+    result = run(command, "--data", str(tmp_path))
+    assert result.exit_code == Exit.REFUSED
+    sentence = f"PLIANT_DATA: expected a folder that this user can create and write, got '{tmp_path / 'work'}' (Permission denied)"
+    assert sentence in result.output
+
+
+@pytest.mark.parametrize("command", ["up", "work"])
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [

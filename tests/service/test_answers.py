@@ -11,6 +11,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from urllib.parse import urljoin
 
 import anyio
 import httpx
@@ -193,6 +194,12 @@ def test_addresses_for_machines_accept_any_query_parameter(http: httpx.Client, a
 def test_a_trailing_slash_is_no_redirect(http: httpx.Client) -> None:
     answer = http.post("/v1/jobs/", headers={"X-Forwarded-Proto": "https"})
     assert (answer.status_code, answer.json()["code"]) == (404, "no_such_address")
+
+
+def test_the_openapi_document_names_its_service_under_any_path(http: httpx.Client) -> None:
+    (server,) = http.get("/openapi.json").json()["servers"]
+    for home in ("http://127.0.0.1:8000/", "https://example.org/pliant/"):
+        assert urljoin(f"{home}openapi.json", server["url"]) == home
 
 
 def test_a_body_that_is_not_json_is_described(http: httpx.Client) -> None:

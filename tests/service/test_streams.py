@@ -258,13 +258,15 @@ def test_a_wait_is_capped_by_the_service(serve: Serve) -> None:
         assert time.monotonic() - begun < 20
 
 
-def test_resuming_after_the_final_event_returns_no_events(running: Running, http: httpx.Client) -> None:
+def test_resuming_after_the_final_event_returns_204_which_ends_an_event_source(
+    running: Running, http: httpx.Client
+) -> None:
     job = submit(http, name="resumed at the end")
     finish(running, job.id, b"x")
     address = f"/v1/jobs/{job.id}/events"
     last = [line for line in http.get(address).text.splitlines() if line.startswith("id: ")][-1].removeprefix("id: ")
     again = http.get(address, headers={"Last-Event-ID": last}, timeout=5)
-    assert (again.status_code, "id:" in again.text) == (200, False)
+    assert (again.status_code, again.content) == (204, b"")
 
 
 def test_a_stream_after_an_id_of_the_future_ends_with_the_job(running: Running, http: httpx.Client) -> None:

@@ -67,7 +67,7 @@ def test_every_line_about_a_job_has_the_field_job() -> None:
             if (
                 isinstance(node, ast.Call)
                 and ast.unparse(node.func).startswith("logger.")
-                and "job %s" in ast.unparse(node.args[0])
+                and any(f"{each} %s" in ast.unparse(node.args[0]) for each in ("job", "attempt", "delivery"))
             ):
                 found += 1
                 if not any(each.arg == "extra" for each in node.keywords):

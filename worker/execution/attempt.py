@@ -59,7 +59,7 @@ def run(id: str, attempt_id: str, *, settings: Settings, worker: str) -> None:
     try:
         stored = RetryDeadline(RETRY_SECONDS).retry(lambda: jobs.records.update(id, claim))
     except (StaleAttempt, UnknownJob) as error:
-        logger.info("delivery %s dropped: %s", attempt_id, error)
+        logger.info("job %s: delivery %s dropped: %s", id, attempt_id, error, extra={"job": id})
         return
     attempt = Attempt(jobs=jobs, id=id, attempt_id=attempt_id, deadline=_deadline(settings))
     about = {"job": id, "attempt": stored.job.attempt, "worker": worker}
@@ -92,7 +92,9 @@ def _conclude(attempt: Attempt, stored: Stored, *, worker: str, settings: Settin
                 attempt.discard(directory)
             return attempt.conclude(end)
         except (StaleAttempt, UnknownJob) as error:
-            logger.info("attempt %s ended: %s", attempt.attempt_id, error)
+            logger.info(
+                "job %s: attempt %s ended: %s", attempt.id, attempt.attempt_id, error, extra={"job": attempt.id}
+            )
             return "stale"
         finally:
             attempt.stages.end()
@@ -138,7 +140,7 @@ class Attempt:
             self.unwanted = True
         except StoreUnavailable as error:
             self._pause_since(now)
-            logger.warning("progress not written: %s", error)
+            logger.warning("job %s: progress not written: %s", self.id, error, extra={"job": self.id})
 
     def should_stop(self) -> bool:
         """Return whether the attempt should stop; reads the record at most every `STATUS_INTERVAL` seconds."""

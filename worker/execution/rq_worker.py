@@ -169,7 +169,8 @@ class PliantWorker(Worker):
         except AWAY as error:
             if self.horse_pid:
                 raise
-            logger.warning("delivery %s: %s", job.id, error)
+            id = str((*job.args, "")[0])
+            logger.warning("job %s: delivery %s: %s", id, job.id, error, extra={"job": id})
 
     def _leave_to_a_larger(self, job: RqJob) -> bool:
         """Requeue a job that needs more memory than this worker has, if another worker has enough; return True if it was requeued."""

@@ -82,7 +82,9 @@ def succeed(
     _check_owner(stored, attempt_id)
     if stored.job.status is Status.CANCELLING:
         return stop(stored, attempt_id=attempt_id, now=now, retention=retention)
+    last = stored.job.progress
     update = {
+        "progress": None if last is None else last.model_copy(update={"fraction": 1.0, "seconds_left": 0.0}),
         "metrics": finished.metrics,
         "outcome": finished.outcome,
         "sentence": finished.sentence,

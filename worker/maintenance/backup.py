@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from pliant.schemas.job import Status
-from pliant.worker.errors import BadBackup, NewerData, StaleAttempt
+from pliant.worker.errors import BadBackup, NewerData, StaleAttempt, UnknownJob
 from pliant.worker.execution.failures import worker_lost
 from pliant.worker.ids import new_attempt_id
 from pliant.worker.jobs import lifecycle
@@ -62,7 +62,7 @@ def write_backup(settings: Settings, target: Path) -> Summary:
     Raises
     ------
     BadBackup
-        The target is a file, or a directory that is neither empty nor a backup.
+        The target is a file, or a directory that is neither empty nor a backup; or a job has lost a file.
     StoreUnavailable
         A store does not answer.
     """
@@ -143,13 +143,29 @@ def _copy_blobs(jobs: Jobs, stored: Stored, target: Path, kept: dict[str, int]) 
                 part = file.with_name(f"{file.name}.part")
                 part.unlink(missing_ok=True)
                 jobs.blobs.fetch(key, part)
+                if part.stat().st_size != size:
+                    raise FileNotFoundError(key)  # it was cut off
                 part.replace(file)
                 new += 1
         except FileNotFoundError:
+            _check_deleted(jobs, stored, key)
             return None
         found[key] = size
     kept.update(found)
     return new
+
+
+def _check_deleted(jobs: Jobs, stored: Stored, key: str) -> None:
+    """Raise BadBackup if a job whose file is missing was not deleted meanwhile."""
+    try:
+        lost = jobs.records.get(stored.job.id).inputs == stored.inputs  # or a new job has its id
+    except UnknownJob:
+        lost = False
+    if lost:
+        raise BadBackup(
+            f"Job {stored.job.id} has lost its file {key}: it is not complete in {jobs.settings.blobs}. Check that PLIANT_BLOB_URL is that "
+            "of the service; otherwise delete the job. An earlier backup in the directory stays as it is."
+        )
 
 
 def _media_types(records: Path) -> dict[str, str]:

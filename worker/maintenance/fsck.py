@@ -94,14 +94,6 @@ def _counts(held: Stored, key: str) -> bool:
     return held.job.status in ACTIVE and key.startswith(f"jobs/{held.job.id}/{held.attempt_id}/")
 
 
-def _held_back(jobs: Jobs, records: list[Stored], waiting: set[str]) -> set[str]:
-    """Return the queued jobs whose owner has reached the limit of running jobs."""
-    taken = Counter(stored.owner for stored in records if stored.job.status in ACTIVE or stored.attempt_id in waiting)
-    usual = jobs.settings.max_running
-    most = {each.job.id: usual if each.max_running is None else each.max_running for each in records}
-    return {each.job.id for each in records if 0 < most[each.job.id] <= taken[each.owner]}
-
-
 def _of_queue(jobs: Jobs, records: list[Stored]) -> Iterator[str]:
     waiting = Counter(jobs.queue.waiting())
     queued = {stored.attempt_id: stored.job.id for stored in records if stored.job.status is Status.QUEUED}
@@ -110,7 +102,7 @@ def _of_queue(jobs: Jobs, records: list[Stored]) -> Iterator[str]:
             yield f"The queue holds {attempt_id}, which no queued job owns."
         elif times > 1:
             yield f"The queue holds {attempt_id} {times} times."
-    held = _held_back(jobs, records, set(waiting))
+    held = jobs.queue.held()
     for attempt_id, id in queued.items():
-        if attempt_id not in waiting and id not in held:
+        if attempt_id not in waiting and attempt_id not in held:
             yield f"Job {id} is queued, but the queue does not hold it."

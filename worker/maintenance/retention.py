@@ -117,13 +117,29 @@ class Retention:
             self.jobs.records.forget_deleted(id)
 
     def _sweep(self) -> None:
-        """Remove files that belong to no job or attempt: from submissions without a record and from killed attempts."""
+        """Remove files that belong to no job or attempt: from submissions without a record and from killed attempts.
+
+        A submission without a record has no results. Those of an unknown job are of lost records, or of another installation.
+        """
         oldest = self.jobs.clock() - ORPHAN_AGE
-        for key, written in self.jobs.blobs.list("jobs/"):
-            wanted = is_wanted(self.jobs, key)
-            if wanted is False or (wanted is None and written < oldest):
+        self.jobs.blobs.clear_unfinished(before=oldest)
+        files = self.jobs.blobs.list("jobs/")
+        with_results = {key.split("/")[1] for key, _ in files if "/artifacts/" in key}
+        kept = set()
+        for key, written in files:
+            id, wanted = key.split("/")[1], is_wanted(self.jobs, key)
+            if wanted is None and id in with_results:
+                kept.add(id)
+            elif wanted is False or (wanted is None and written < oldest):
                 self.jobs.blobs.delete(key)
                 logger.info("removed %s, which belongs to no job or attempt", key)
+        if kept:
+            logger.warning(
+                "the files of %d job(s) with results but without a record are kept, for example %s; check that PLIANT_REDIS_URL, "
+                "PLIANT_QUEUE and PLIANT_BLOB_URL are of one installation",
+                len(kept),
+                min(kept),
+            )
 
     def _clear_work(self) -> None:
         """Remove scratch directories of ended attempts whose worker was killed before it removed them."""

@@ -57,7 +57,7 @@ def open_data_directory(settings: Settings) -> None:
         raise InvalidSetting(
             variable_of("data"),
             expected="a folder that this user can create and write",
-            got=f"{str(settings.data)!r} ({fault.strerror})",
+            got=f"{str(fault.filename or settings.data)!r} ({fault.strerror})",
             hint="Make the folder for the user that runs Pliant, or name another one.",
         ) from fault
 

@@ -103,7 +103,7 @@ class Valkey:
                 os.close(supervisor_lock)
                 raise DataDirectoryInUse(str(data), holder="a Valkey server that does not stop")
         try:
-            _make_private(path.parent)
+            _make_private(path.parent, home=home)
         except ServerFailed:
             os.close(lock)
             os.close(supervisor_lock)
@@ -227,14 +227,17 @@ def _command(binary: Path, home: Path, path: Path) -> list[str]:
     return [str(binary), *(part for name, value in options.items() for part in (f"--{name}", value))]
 
 
-def _make_private(directory: Path) -> None:
+def _make_private(directory: Path, *, home: Path) -> None:
+    """Create the directory of the socket; refuse one of other users. `home` holds the records, and must not be removed."""
     directory.mkdir(parents=True, exist_ok=True, mode=0o700)
     found = directory.lstat()  # symbolic links are not followed, since another user may have placed them
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) & 0o022:
-        raise ServerFailed(
-            f"{directory} is writable by other users, who could impersonate the server. Remove it or choose another data directory.",
-            log="",
-        )
+        what = f"{directory} is writable by other users, who could impersonate the server."
+        remedy = "Remove it or choose another data directory."
+        if directory == home:
+            what = f"{directory} is a symbolic link, or belongs to another user."
+            remedy = "Run the command as the user that runs Pliant, for example with `sudo -u pliant`."
+        raise ServerFailed(f"{what} {remedy}", log="")
 
 
 def _lock(descriptor: int) -> bool:

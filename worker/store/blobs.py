@@ -217,6 +217,13 @@ class Blobs:
             with suppress(FileNotFoundError):
                 self._call(lambda key=key: obstore.delete(self._store, key))  # type: ignore[misc]
 
+    def clear_unfinished(self, *, before: datetime) -> None:
+        """Remove the temporary files that killed processes last wrote before a time. A directory keeps them, and lists none."""
+        for path in self.directory.rglob("*#*") if self.directory is not None else ():
+            with suppress(FileNotFoundError):
+                if path.stat().st_mtime < before.timestamp():
+                    path.unlink()
+
     def list(self, prefix: str = "") -> list[tuple[str, datetime]]:
         """Return key and modification time of all files under a prefix."""
         return [(str(each["path"]), each["last_modified"]) for each in self._entries(prefix)]

@@ -212,6 +212,7 @@ def test_the_timeout_covers_all_retries(clock: Clock) -> None:
     with pytest.raises(WaitTimeout, match="The timeout of 3 s passed") as caught:
         client_of(Flaky(*[answer(503)] * 99), clock).options(timeout=3)
     assert clock.now <= 3
+    assert "Sentence. " in str(caught.value)
     assert isinstance(caught.value, TimeoutError)
 
 

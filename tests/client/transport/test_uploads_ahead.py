@@ -17,6 +17,14 @@ from pliant.client.multipart import Remainder
 from pliant.service.testing import InMemoryService
 
 PATIENT = Retry(shortest_pause=0.01, longest_pause=0.05)
+PROBLEM = {
+    "type": "t",
+    "title": "Slow down",
+    "status": 429,
+    "detail": "Slow down.",
+    "code": "too_many_requests",
+    "retryable": True,
+}
 POINTS = np.random.default_rng(0).normal(size=(6, 15_000, 2))
 
 
@@ -162,3 +170,24 @@ def test_after_an_offset_mismatch_the_offset_is_read_again(tmp_path: Path) -> No
     assert b'name="mesh"; filename="mesh.obj"' in post.content
     assert b'name="tracks_upload"' in post.content
     assert len(post.content) < 10_000
+
+
+def test_a_rate_of_one_request_at_a_time_lets_an_upload_through() -> None:
+    class Slow(InMemoryService):
+        """Allows one request after each refusal, as a used up rate limit does."""
+
+        allowed = 1
+
+        def handle_request(self, request: httpx.Request) -> httpx.Response:
+            if request.url.path.startswith("/v1/uploads/"):
+                self.allowed -= 1
+                if self.allowed < 0:
+                    self.allowed = 1
+                    return httpx.Response(
+                        429, json=PROBLEM, headers={"Retry-After": "0", "Content-Type": "application/problem+json"}
+                    )
+            return super().handle_request(request)
+
+    hasty = Retry(patience=3, shortest_pause=0.01, longest_pause=0.05)
+    with Client("http://pliant.test", transport=Slow(), retries=hasty) as client:
+        assert client.submit(POINTS, mesh="none").record.interpretation.num_points == 15_000

@@ -142,6 +142,14 @@ def test_load_dependent_alerts_fire_on_synthetic_metrics(slow: str, depth: int, 
     assert firing == {"PliantErrors", "PliantWebhooksFail", *load}
 
 
+def test_a_readiness_probe_while_there_is_no_worker_is_no_error() -> None:
+    prometheus = Prometheus()
+    for step in range(50):
+        told = f'pliant_store_up 1\npliant_http_requests_total{{route="/readyz",status="503"}} {10 * step}\n'
+        prometheus.scrape(told, at=EVERY * step)
+        assert prometheus.firing(RULES) == set()
+
+
 def test_missing_metrics_fire_their_alert() -> None:
     prometheus = Prometheus()
     firing = []

@@ -34,6 +34,8 @@ def test_the_running_limit_holds_and_the_next_job_starts_when_one_ends(
     world.pass_seconds(30)
     assert waiting() == [*adas[:2], *bobs], "what is held back is not taken for forgotten"
     assert findings(world.jobs, pause=0) == []
+    unset = dataclasses.replace(world.jobs, settings=dataclasses.replace(world.jobs.settings, max_running=0))
+    assert findings(unset, pause=0) == [], "nor by an operator whose shell has no PLIANT_MAX_RUNNING"
     attempt_ids = [world.claim(adas[0]), world.claim(adas[1])]
 
     def alive() -> None:

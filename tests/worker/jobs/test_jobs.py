@@ -290,6 +290,15 @@ def test_unfinished_jobs_can_be_cancelled_and_finished_ones_cannot(jobs: Jobs, s
     )
 
 
+def test_the_progress_of_a_succeeded_job_is_complete(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+    stored = claim(jobs, submit().id)
+    late = Progress(stage="exporting", fraction=0.993, seconds_left=0.1, updated_at=NOW)
+    reported = lifecycle.report(stored, attempt_id=stored.attempt_id, progress=late)
+    done = Finished(metrics={}, outcome="converged", sentence="Converged.", warnings=(), artifacts=())
+    ended = lifecycle.succeed(reported, done, attempt_id=stored.attempt_id, prefix="p/", now=NOW, retention=0)
+    assert ended.job.progress == late.model_copy(update={"fraction": 1.0, "seconds_left": 0.0})
+
+
 def test_a_result_is_published_and_read_in_ranges(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
     id = submit().id
     with pytest.raises(UnknownArtifact, match="only a succeeded job"):

@@ -193,6 +193,28 @@ def test_a_job_deleted_during_the_backup_is_omitted(
     assert findings(Jobs.open(empty), pause=0) == []
 
 
+def test_a_backup_without_the_services_blob_store_is_refused_and_keeps_the_earlier_one(
+    jobs: Jobs, sent: dict[str, str], empty: Settings, tmp_path: Path
+) -> None:
+    """Every job was taken for deleted, and the earlier backup was emptied."""
+    write_backup(jobs.settings, tmp_path / "backup")
+    other = replace(jobs.settings, blob_url=(tmp_path / "other").as_uri())
+    with pytest.raises(BadBackup, match=r"has lost its file jobs/.* Check that PLIANT_BLOB_URL is that of the service"):
+        write_backup(other, tmp_path / "backup")
+    assert restore_backup(empty, tmp_path / "backup").jobs == len(sent)
+
+
+def test_a_result_that_was_cut_off_is_not_backed_up(jobs: Jobs, sent: dict[str, str], tmp_path: Path) -> None:
+    done = jobs.records.get(sent["done"])
+    key = f"{done.prefix}{done.job.artifacts[0].name}"
+    jobs.blobs.delete(key)
+    jobs.blobs.write(key, b"cut off")
+    with pytest.raises(BadBackup, match=f"Job {sent['done']} has lost its file {key}: it is not complete"):
+        write_backup(jobs.settings, tmp_path / "backup")
+    jobs.delete(sent["done"])
+    assert write_backup(jobs.settings, tmp_path / "backup").jobs == len(sent) - 1
+
+
 @pytest.fixture
 def backup(jobs: Jobs, sent: dict[str, str], tmp_path: Path) -> Path:
     write_backup(jobs.settings, tmp_path / "backup")

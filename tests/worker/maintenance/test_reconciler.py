@@ -208,6 +208,29 @@ def test_files_that_belong_to_no_job_are_removed_once_old(
     assert sweep_at(datetime.now(UTC) + timedelta(hours=7)) == wanted
 
 
+def test_temporary_files_of_killed_processes_are_removed_with_the_stray_ones(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[datetime] = []
+    monkeypatch.setattr(Blobs, "clear_unfinished", lambda self, *, before: asked.append(before))
+    world.monotonic += 3600
+    world.pass_seconds(1)
+    assert asked == [world.now - timedelta(hours=6)]
+
+
+def test_results_without_a_record_are_kept_and_named(
+    world: World, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As with the PLIANT_BLOB_URL of another installation, or after a loss of the records: everything was removed at once."""
+    (tmp_path / "file").write_text("x")
+    for name in ("inputs.npz", "artifacts/shapes.npz"):
+        world.jobs.blobs.put(f"jobs/theirs/theirs-1/{name}", tmp_path / "file")
+    world.now, world.monotonic = datetime.now(UTC) + timedelta(days=1), world.monotonic + 3600
+    world.pass_seconds(1)
+    assert len(world.jobs.blobs.list("jobs/theirs/")) == 2
+    assert "the files of 1 job(s) with results but without a record are kept, for example theirs" in caplog.text
+
+
 def test_scratch_directories_of_ended_attempts_are_removed(world: World, submit: Callable[[World], str]) -> None:
     id = submit(world)
     attempt_id = world.claim(id)

@@ -13,9 +13,10 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from pliant.worker.errors import DataDirectoryInUse, ServerFailed, StoreUnavailable
+from pliant.worker.errors import DataDirectoryInUse, InvalidSetting, ServerFailed, StoreUnavailable
 from pliant.worker.paths import FOLDERS, LONGEST_SOCKET_PATH, make_data_directory, socket_path, valkey_directory
 from pliant.worker.processes import valkey as valkey_module
+from pliant.worker.processes.preflight import open_data_directory
 from pliant.worker.processes.supervisor import FIRST_PAUSE, Child, Supervisor, worker_children
 from pliant.worker.processes.valkey import Valkey, find_binary
 from pliant.worker.settings import Settings
@@ -367,6 +368,18 @@ def test_a_socket_directory_that_others_may_write_is_refused(tmp_path: Path) -> 
             directory.rmdir()
 
 
+def test_the_records_of_another_user_are_not_to_be_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As when the command is run with `sudo` alone: the socket's directory is that of the records."""
+    Valkey.claim(tmp_path).release()
+    own = os.getuid()
+    monkeypatch.setattr("os.getuid", lambda: own + 1)
+    with pytest.raises(
+        ServerFailed, match=r"belongs to another user\. Run the command as the user that runs Pliant"
+    ) as caught:
+        Valkey.claim(tmp_path)
+    assert "Remove" not in str(caught.value)
+
+
 def test_a_long_socket_path_does_not_follow_tmpdir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A command with another TMPDIR than the server's would not find it otherwise."""
     deep = tmp_path / "/".join(["deep"] * 30)
@@ -387,6 +400,22 @@ def test_a_socket_directory_that_is_a_link_is_refused(tmp_path: Path) -> None:
             Valkey.claim(deep)
     finally:
         directory.unlink()
+
+
+def test_a_folder_of_another_user_in_the_data_directory_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after a command run with `sudo` alone: the service started, and called the blob store unavailable for two minutes."""
+    make_data_directory(tmp_path)
+    closed = tmp_path / "blobs"
+    monkeypatch.setattr("os.access", lambda path, mode: path != closed)
+    with pytest.raises(PermissionError) as caught:
+        Valkey.claim(tmp_path)
+    assert caught.value.filename == str(closed)
+    with pytest.raises(
+        InvalidSetting, match=rf"PLIANT_DATA: expected a folder that this user can .*'{closed}' \(Permission denied\)"
+    ):
+        open_data_directory(Settings(data=tmp_path))
 
 
 def test_the_data_directory_is_private_to_its_owner(tmp_path: Path) -> None:

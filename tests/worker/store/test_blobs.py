@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,20 @@ def file(tmp_path: Path) -> Path:
     path = tmp_path / "file"
     path.write_bytes(bytes(range(256)) * 10_000)
     return path
+
+
+def test_temporary_files_of_killed_processes_are_removed_once_old(tmp_path: Path) -> None:
+    """Between file systems a file is copied, which takes seconds; what a killed process had copied stayed for ever."""
+    blobs = Blobs.open((tmp_path / "store").as_uri())
+    blobs.write("jobs/one/whole", b"x")
+    old, new = (tmp_path / "store" / "jobs" / "one" / name for name in ("half#1", "half#2"))
+    for path in (old, new):
+        path.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    assert [key for key, _ in blobs.list()] == ["jobs/one/whole"]
+    blobs.clear_unfinished(before=datetime.now(UTC) - timedelta(hours=1))
+    assert (old.exists(), new.exists()) == (False, True)
+    Blobs.open("memory:///").clear_unfinished(before=datetime.now(UTC))
 
 
 def test_a_stored_file_is_read_back(blobs: Blobs, file: Path, tmp_path: Path) -> None:
