@@ -93,6 +93,17 @@ def test_a_film_is_checked_without_being_tracked(film: Path, region: Path) -> No
 
 
 @forked
+def test_a_film_of_equal_frames_is_refused_when_it_is_checked_and_one_that_begins_with_them_is_not(
+    tmp_path: Path,
+) -> None:
+    pictures = films.textured_pictures(3, SIZE)
+    still = films.write_film(tmp_path / "still.mkv", pictures[:1] * 20)
+    assert refusal(FilmSource(still)).code == "undecodable_film"
+    begins = films.write_film(tmp_path / "begins.mkv", [*pictures[:1] * 18, *pictures[1:]])
+    assert read_film(FilmSource(begins), Options()).facts.frames == 20
+
+
+@forked
 def test_a_film_has_its_own_size_and_no_use_for_options_of_tracks(film: Path) -> None:
     facts = read_film(FilmSource(film), Options()).facts
     assert film_options(Options(image_size="96x72"), facts).image_size == "96x72"
