@@ -185,3 +185,12 @@ def test_folders_of_pictures_are_sent_as_zips(tmp_path: Path) -> None:
         jobs = [json.loads(ran.stdout)] if len(given) == 1 else [row["job"] for row in json.loads(ran.stdout)]
         assert [job["name"] for job in jobs] == [each.name for each in given]
         assert {job["interpretation"]["num_frames"] for job in jobs} == {4}
+
+
+def test_the_result_of_a_films_tracks_repeats_the_trackers_warnings(film: Path, tmp_path: Path) -> None:
+    tracks = tmp_path / "tracks.npz"
+    tracked = CliRunner().invoke(app, ["track", str(film), "--frames", ":5", "-o", str(tracks)])
+    assert tracked.exit_code == 0, tracked.output
+    words = solve(tracks, "-o", tmp_path, "-O", "outputs=[]", "-O", "prior=smooth", "-O", "surface=free").output
+    assert words.count("Only 5 frames are tracked") == words.count("No region was given") == 1
+    assert "Only 5 frames are tracked" in json.loads((tmp_path / "report.json").read_text())["warnings"][1]
