@@ -62,6 +62,19 @@ def test_a_region_drawn_with_the_mouse_is_sent_with_the_film(
     assert corners.max(0) == pytest.approx([0.8 * WIDTH, 0.8 * HEIGHT], abs=2)
 
 
+def test_a_lasso_that_runs_around_twice_leaves_no_hole(filming: Page, films: dict[str, bytes]) -> None:
+    drop(filming, {"film.webm": films["film.webm"]})
+    filming.get_by_role("button", name="Draw a region").click()
+    read = "(it) => [...it.getContext('2d').getImageData(it.width / 2, it.height / 2, 1, 1).data].slice(0, 3)"
+    canvas = filming.get_by_role("application")
+    undimmed = canvas.evaluate(read)
+    around = ((0.2, 0.2), (0.8, 0.2), (0.8, 0.8), (0.2, 0.8), (0.2, 0.25))
+    drag(filming, *around, *((x + 0.05, y + 0.05) for x, y in around))
+    expect(filming.get_by_role("dialog").get_by_role("status")).to_contain_text("Lasso with")
+    assert canvas.evaluate(read) == pytest.approx(undimmed, abs=2)
+    filming.get_by_role("button", name="Cancel").click()
+
+
 def test_a_region_is_drawn_after_a_drag_from_outside_has_selected_text(filming: Page, films: dict[str, bytes]) -> None:
     drop(filming, {"film.webm": films["film.webm"]})
     filming.get_by_role("button", name="Draw a region").click()
