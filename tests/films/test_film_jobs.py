@@ -306,7 +306,11 @@ def test_films_are_told_apart_from_track_files_and_spreadsheets(film: Path, tmp_
         tmp_path / "missing.mov",
         tmp_path / "a.avi",
         tmp_path / "refused.mts",
+        tmp_path / "animated.png",
     )
+    first, *others = [Image.fromarray(each) for each in films.textured_pictures(3)]
+    first.save(tmp_path / "animated.png", save_all=True, append_images=others)
+    first.save(tmp_path / "still.png")
     (tmp_path / "refused.mts").write_bytes(bytes(4) + b"G" + bytes(200))
     assert [path for path in given if not looks_like_film(path)] == []
     sheets = {
@@ -315,7 +319,7 @@ def test_films_are_told_apart_from_track_files_and_spreadsheets(film: Path, tmp_
     }
     for name, members in sheets.items():
         films.zip_of(tmp_path / name, dict.fromkeys(members, b""))
-    names = ("tracks.npz", "tracks.npy", "broken.zip", "missing.npz", *sheets)
+    names = ("tracks.npz", "tracks.npy", "broken.zip", "missing.npz", "still.png", *sheets)
     others = [tmp_path / name for name in names]
     assert [path for path in others if looks_like_film(path)] == []
 
