@@ -129,8 +129,8 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
         from pliant.tracking.estimate import estimate
 
         expected = estimate(
-            film, region=region, region_frame=options["region_frame"], grid_step=options["grid_step"],
-            longest_side=options["longest_side"], threads=request["threads"],
+            film, region=region, region_frame=options["region_frame"], template_frame=options["template_frame"],
+            grid_step=options["grid_step"], longest_side=options["longest_side"], threads=request["threads"],
         )  # fmt: skip
         facts |= {"points": expected.points, "track_seconds": expected.seconds}
     if request["picture"]:
