@@ -338,6 +338,15 @@ def test_a_region_can_be_drawn_by_touch(filming: Page, films: dict[str, bytes]) 
     expect(status).to_contain_text("Lasso with")
     expect(status).to_contain_text("160 × 132 pixels")
 
+    touch("touchStart", (0.5, 0.5))  # a second finger ends the stroke, which changes nothing
+    touch("touchStart", (0.5, 0.5), (0.6, 0.55))
+    for step in (0.05, 0.1, 0.15):
+        touch("touchMove", (0.5 - step, 0.5 - step), (0.6 + step, 0.55 + step))
+    touch("touchEnd")
+    expect(status).to_contain_text("160 × 132 pixels")
+    filming.get_by_role("button", name="Undo").click()
+    expect(status).to_contain_text("No region")
+
 
 @pytest.mark.parametrize(("width", "scheme"), BOTH_WIDTHS_AND_THEMES)
 def test_form_and_dialog_have_no_accessibility_finding(
