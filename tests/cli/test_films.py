@@ -117,6 +117,11 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
         inspect(film, "-O", "region_frame=3").output.split()
     )
     assert "warning Only 5 frames are tracked." in words
+    blank = [np.full((72, 96, 3), 40 + shade, np.uint8) for shade in range(4)]
+    dark = films.write_film(tmp_path / "dark.mp4", [*blank, *films.textured_pictures(4, (96, 72))])
+    assert "points none: no texture in the region in frame 2" in " ".join(
+        inspect(dark, "-O", "region_frame=2").output.split()
+    )
     assert "warning" not in inspect(film, "-O", "region_polygon=[[20,20],[70,20],[70,55]]").output
     assert "note Not used for films: layout." in " ".join(inspect(film, "-O", "layout=points_frames").output.split())
     contradiction = ("-O", "focal=500", "-O", "field_of_view=60")
