@@ -39,9 +39,13 @@ FINISH_SECONDS = 3e-7
 """Seconds per frame and point to convert the solution to the tracks' unit and compute inlier probabilities; measured for 50 × 30,000 and
 50 × 100,000."""
 
-SURFACE_SECONDS, SURFACE_SETUP = 0.45, 40
-"""Search for an isometric surface: seconds per frame, on at most 24 frames, and duration of its preparation in units of work. Measured for
-paper, a comic page and a shallow face."""
+SURFACE_SECONDS, SURFACE_FRAMES, SURFACE_UNITS, SURFACE_SETUP = 0.45, 24, 280, 40
+"""Search for an isometric surface: seconds per frame, the number of frames on which it is done, units of work, and duration of its
+preparation in units of work. Measured for paper, a comic page and a shallow face."""
+
+FIRST_LOOK_UNITS, ANCHORS_SECONDS = 13, 0.01
+"""Of more frames, the units of work before their anchors are chosen, and the seconds of choosing them per frame: .004 with 300 points, .01
+with 2,000 and 8,000, each in 100, 300 and 600 frames."""
 
 COMPLETION_SECONDS, MOST_COMPLETED, RANK_GROWTH = 8e-7, (60, 600), 2.0
 """Completion of hidden positions: seconds per squared frame count and point; the numbers of frames and of points above which the time no
@@ -140,7 +144,7 @@ def planned(
     seconds = frames * (ITERATION_FRAME_SECONDS + ITERATION_SECONDS[gaussian] * points)
     shapes = Stage("shapes", units * seconds, round(units))
     last = [Stage("finish", FINISH_SECONDS * frames * points, 3), *([stage_of("trust", frames)] if gaussian else [])]
-    first = [Stage("surface", SURFACE_SECONDS * min(frames, 24), 280, setup=SURFACE_SETUP)] if sheet else []
+    first = search_for_sheet(frames) if sheet else []
     most_frames, most_points = MOST_COMPLETED
     filled = COMPLETION_SECONDS * frames * min(frames, most_frames) * min(points, most_points) if unseen > 0 else 0.0
     used = learned_frames(frames) if ordered else frames
@@ -148,6 +152,16 @@ def planned(
     first.append(Stage("completion", 0.1 + filled, 6, growth=RANK_GROWTH))
     learned = learning(frames, used, gaussian=gaussian, known_cameras=known_cameras, known_scales=known_scales)
     return (*first, *learned, start, shapes, *last)
+
+
+def search_for_sheet(frames: int) -> list[Stage]:
+    """Return the stages of the search for an isometric surface; `anchors` and `surface` are skipped if a first look rejects it."""
+    if frames <= SURFACE_FRAMES:
+        return [Stage("surface", SURFACE_SECONDS * frames, SURFACE_UNITS, setup=SURFACE_SETUP)]
+    each = SURFACE_SECONDS * SURFACE_FRAMES / (SURFACE_UNITS + SURFACE_SETUP)
+    later = SURFACE_UNITS - FIRST_LOOK_UNITS
+    look = Stage("first_look", (FIRST_LOOK_UNITS + SURFACE_SETUP) * each, FIRST_LOOK_UNITS, setup=SURFACE_SETUP)
+    return [look, Stage("anchors", ANCHORS_SECONDS * frames, 1), Stage("surface", later * each, later)]
 
 
 def unseen_frames(visible: Floats) -> float:

@@ -8,16 +8,20 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from pliant.tracking.appearance import Appearance
-from pliant.tracking.chaining import DELTAS, FIRST_SPACING, FIRST_STEPS, FLOW_MARGIN
+from pliant.tracking.chaining import DELTAS, FIRST_SPACING, FIRST_STEPS, box_around
 from pliant.tracking.decoding.film import Film
 from pliant.tracking.flow import Bools, Grey, dense_flow, opencv_serial
-from pliant.tracking.region import Region, read_region
+from pliant.tracking.region import LONG_STEP, Region, read_region
 from pliant.tracking.registration import Registration
 from pliant.tracking.seeding import Seeds, default_step, neighbours, place
-from pliant.tracking.survey import tracking_scale
+from pliant.tracking.survey import middle_of, tracking_scale
 
 FLOWS = 2 * (1 + len(DELTAS))
 """Flows per frame: forward and backward, from the template and from each earlier frame."""
+
+LOCATING_FLOWS = 4
+"""Flows of the whole picture for every `LONG_STEP` frames that the region is carried: forward and backward, directly and from the frame
+before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,14 +32,21 @@ class Estimate:
     """Points that would be tracked, before short-lived ones are dropped."""
 
     seconds: float
-    """Wall time of flow, registration and comparison, without decoding and without fitting the points' paths. 0 without points or if the
-    film gives no number of frames."""
+    """Wall time of carrying the region to the template, flow, registration and comparison, without decoding and without fitting the
+    points' paths. 0 without points or if the film gives no number of frames."""
 
 
 def estimate(
-    film: Film, *, region: Region | None, region_frame: int, grid_step: float | None, longest_side: int, threads: int
+    film: Film,
+    *,
+    region: Region | None,
+    region_frame: int,
+    template_frame: int | None = None,
+    grid_step: float | None,
+    longest_side: int,
+    threads: int,
 ) -> Estimate:
-    """Place the points in the region's frame; time one flow of the region's size, and the other work per frame.
+    """Place the points in the region's frame; time one flow around the region and one of the picture, and the other work per frame.
 
     Raises
     ------
@@ -54,8 +65,18 @@ def estimate(
     if len(seeds.points) == 0:
         return Estimate(0, 0.0)
     with opencv_serial():
-        seconds = FLOWS * _flow_seconds(grey, mask) + _rounds_seconds(grey, mask, seeds)
-    return Estimate(len(seeds.points), count * seconds / max(threads, 1))
+        seconds = count * (FLOWS * _flow_seconds(grey[_box(mask)]) + _rounds_seconds(grey, mask, seeds))
+        if region is not None and count > 0:
+            origin = (region_frame - start) / step
+            template = _template(origin, count) if template_frame is None else (template_frame - start) / step
+            seconds += abs(template - origin) / LONG_STEP * LOCATING_FLOWS * _flow_seconds(grey)
+    return Estimate(len(seeds.points), seconds / max(threads, 1))
+
+
+def _template(origin: float, count: int) -> float:
+    """Return the template of `count` frames by default, if the region was drawn in frame `origin` of them and is not lost."""
+    middle = middle_of(0, count)
+    return origin if middle.start <= origin < middle.stop else count / 2
 
 
 def _frame(film: Film, index: int, longest_side: int) -> tuple[Grey, float]:
@@ -72,11 +93,15 @@ def _frame(film: Film, index: int, longest_side: int) -> tuple[Grey, float]:
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8), scale
 
 
-def _flow_seconds(grey: Grey, mask: Bools) -> float:
-    """Time the flow inside the region's box between the frame and the frame moved by a pixel."""
+def _box(mask: Bools) -> tuple[slice, slice]:
+    """Return the part of a frame in which flow is computed while the region does not move."""
     row, column = np.nonzero(mask)
-    box = np.s_[row.min() : row.max() + 1, column.min() : column.max() + 1]
-    first = np.ascontiguousarray(np.pad(grey[box], FLOW_MARGIN, mode="edge"))
+    return box_around(np.array([(column.min(), row.min()), (column.max(), row.max())], dtype=np.float32), mask.shape)
+
+
+def _flow_seconds(picture: Grey) -> float:
+    """Time the flow between a picture and the picture moved by a pixel."""
+    first = np.ascontiguousarray(picture)
     second = np.ascontiguousarray(np.roll(first, 1, axis=1))
     similar = dense_flow(first, second)
     began = time.perf_counter()

@@ -132,10 +132,10 @@ class TrackedFilm:
         return self.film.size
 
     def save_npz(self, path: Path | str) -> None:
-        """Write tracks, mesh and times as a compressed NumPy archive.
+        """Write tracks, mesh, times and warnings as a compressed NumPy archive.
 
         Keys: `tracks`, `visibility`, `confidence`, `faces`, `grid`, `uv`, `template`, `template_image`, `frame_indices`,
-        `frame_times`, `fps`, `image_size` (width, height).
+        `frame_times`, `fps`, `image_size` (width, height), `warnings`.
         """
         with Path(path).open("wb") as stream:  # an open file keeps NumPy from adding a suffix
             np.savez_compressed(
@@ -152,6 +152,7 @@ class TrackedFilm:
                 frame_times=self.film.frame_times,
                 fps=self.film.fps,
                 image_size=np.array(self.film.size),
+                warnings=np.array(self.warnings, dtype=np.str_),
             )
 
     def contact_sheet(self) -> bytes:

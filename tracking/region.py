@@ -48,8 +48,8 @@ def read_region(region: Region, size: tuple[int, int]) -> Bools:
     """Convert a region to a mask, shape `(H, W)`.
 
     The region is the path of a mask picture of the film's size, an array `(H, W)` (bool, or uint8 with 128 and above inside, or of
-    0 and 1), or a polygon of pixels `(N, 2)` with N ≥ 3. In pictures with transparency, opaque pixels are inside. Pictures must be black
-    and white, except for a soft outline; as the film's own, they are turned by their EXIF orientation.
+    0 and 1), or a polygon of pixels `(N, 2)` with N ≥ 3, whose outline may cross itself. In pictures with transparency, opaque pixels are
+    inside. Pictures must be black and white, except for a soft outline; as the film's own, they are turned by their EXIF orientation.
 
     Raises
     ------
@@ -207,9 +207,22 @@ def _from_polygon(given: ArrayLike, size: tuple[int, int]) -> Grey:
     along, across = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
     if across <= 1e-6 * along:
         raise _wrong_polygon("corners on one line")
-    mask = np.zeros(size[::-1], dtype=np.uint8)
-    cv2.fillPoly(mask, [np.round(corners).astype(np.int32)], 255)
+    outline = np.round(corners).astype(np.int64)
+    mask = np.where(_turns(outline, size) != 0, 255, 0).astype(np.uint8)
+    cv2.fillPoly(mask, [outline.astype(np.int32)], 255)  # adds the outline itself
     return mask
+
+
+def _turns(outline: NDArray[np.int64], size: tuple[int, int]) -> NDArray[np.int64]:
+    """Return how often an outline `(N, 2)` runs around each pixel, shape `(H, W)`: twice where a drawn line overlaps itself."""
+    width, height = size
+    steps = np.zeros((height, width + 1), dtype=np.int64)
+    for (x0, y0), (x1, y1) in zip(outline.tolist(), np.roll(outline, -1, axis=0).tolist(), strict=True):
+        rows = np.arange(max(min(y0, y1), 0), min(max(y0, y1), height))
+        if len(rows):
+            crossings = np.ceil(x0 + (rows - y0) * ((x1 - x0) / (y1 - y0))).astype(np.int64)
+            steps[rows, crossings.clip(0, width)] += 1 if y1 > y0 else -1
+    return np.cumsum(steps, axis=1)[:, :width]
 
 
 def _wrong_polygon(got: str) -> FilmError:

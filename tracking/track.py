@@ -129,12 +129,17 @@ def track_film(
 
 def _track(run: Run, found: Survey, plan: Plan, step: float | None, *, whole: bool, region_frame: int) -> TrackedFilm:
     """Seed, chain, track again, drop points visible in few frames, and assemble the result."""
+
+    def warnings(rough: float) -> list[str]:
+        return warnings_before(
+            run.film, found, plan.start, plan.stop, whole=whole, region_frame=region_frame, rough=rough,
+            lost_in_middle=plan.lost_in_middle,
+        )  # fmt: skip
+
     template = run.store.read(plan.template)
+    run.on_warnings(warnings(1.0))  # a cut may be why the region has no texture
     seeds, textured = _placed(template, plan, step)
-    notes = warnings_before(
-        run.film, found, plan.start, plan.stop, whole=whole, region_frame=region_frame, rough=textured,
-        lost_in_middle=plan.lost_in_middle,
-    )  # fmt: skip
+    notes = warnings(textured)
     run.on_warnings(notes)
     appearance = Appearance.of(template, plan.mask, seeds.points, neighbours(seeds.grid, len(seeds.points)))
     fine = Registration.of(template, seeds.points, seeds.grid, noise=appearance.noise)

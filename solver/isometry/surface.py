@@ -22,6 +22,7 @@ from pliant.solver.isometry.homographies import off_homography
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import refine
 from pliant.solver.isometry.restarts import carried, refine_with_restarts, unlikeness
+from pliant.solver.monitor import enter
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, Tracks
 from pliant.solver.tracks.normalization import relative
@@ -154,7 +155,10 @@ def _search(tracks: Tracks, centre: Floats, focal: float, required: bool, should
     search = _prepared(tracks.points[part], confidence[part], centre, should_stop)
     against = _implausible(search, focal, required)
     if against is None and len(part) < tracks.num_frames:
+        enter(should_stop, "anchors")
         search = _prepared(tracks.points, confidence, centre, should_stop)
+        should_stop()
+        enter(should_stop, "surface")
     return against or search or TOO_LITTLE
 
 

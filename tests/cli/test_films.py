@@ -117,6 +117,11 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
         inspect(film, "-O", "region_frame=3").output.split()
     )
     assert "warning Only 5 frames are tracked." in words
+    blank = [np.full((72, 96, 3), 40 + shade, np.uint8) for shade in range(4)]
+    dark = films.write_film(tmp_path / "dark.mp4", [*blank, *films.textured_pictures(4, (96, 72))])
+    assert "points none: no texture in the region in frame 2" in " ".join(
+        inspect(dark, "-O", "region_frame=2").output.split()
+    )
     assert "warning" not in inspect(film, "-O", "region_polygon=[[20,20],[70,20],[70,55]]").output
     assert "note Not used for films: layout." in " ".join(inspect(film, "-O", "layout=points_frames").output.split())
     contradiction = ("-O", "focal=500", "-O", "field_of_view=60")
@@ -185,3 +190,12 @@ def test_folders_of_pictures_are_sent_as_zips(tmp_path: Path) -> None:
         jobs = [json.loads(ran.stdout)] if len(given) == 1 else [row["job"] for row in json.loads(ran.stdout)]
         assert [job["name"] for job in jobs] == [each.name for each in given]
         assert {job["interpretation"]["num_frames"] for job in jobs} == {4}
+
+
+def test_the_result_of_a_films_tracks_repeats_the_trackers_warnings(film: Path, tmp_path: Path) -> None:
+    tracks = tmp_path / "tracks.npz"
+    tracked = CliRunner().invoke(app, ["track", str(film), "--frames", ":5", "-o", str(tracks)])
+    assert tracked.exit_code == 0, tracked.output
+    words = solve(tracks, "-o", tmp_path, "-O", "outputs=[]", "-O", "prior=smooth", "-O", "surface=free").output
+    assert words.count("Only 5 frames are tracked") == words.count("No region was given") == 1
+    assert "Only 5 frames are tracked" in json.loads((tmp_path / "report.json").read_text())["warnings"][1]

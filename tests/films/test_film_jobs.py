@@ -93,6 +93,17 @@ def test_a_film_is_checked_without_being_tracked(film: Path, region: Path) -> No
 
 
 @forked
+def test_a_film_of_equal_frames_is_refused_when_it_is_checked_and_one_that_begins_with_them_is_not(
+    tmp_path: Path,
+) -> None:
+    pictures = films.textured_pictures(3, SIZE)
+    still = films.write_film(tmp_path / "still.mkv", pictures[:1] * 20)
+    assert refusal(FilmSource(still)).code == "undecodable_film"
+    begins = films.write_film(tmp_path / "begins.mkv", [*pictures[:1] * 18, *pictures[1:]])
+    assert read_film(FilmSource(begins), Options()).facts.frames == 20
+
+
+@forked
 def test_a_film_has_its_own_size_and_no_use_for_options_of_tracks(film: Path) -> None:
     facts = read_film(FilmSource(film), Options()).facts
     assert film_options(Options(image_size="96x72"), facts).image_size == "96x72"
@@ -295,7 +306,11 @@ def test_films_are_told_apart_from_track_files_and_spreadsheets(film: Path, tmp_
         tmp_path / "missing.mov",
         tmp_path / "a.avi",
         tmp_path / "refused.mts",
+        tmp_path / "animated.png",
     )
+    first, *others = [Image.fromarray(each) for each in films.textured_pictures(3)]
+    first.save(tmp_path / "animated.png", save_all=True, append_images=others)
+    first.save(tmp_path / "still.png")
     (tmp_path / "refused.mts").write_bytes(bytes(4) + b"G" + bytes(200))
     assert [path for path in given if not looks_like_film(path)] == []
     sheets = {
@@ -304,7 +319,7 @@ def test_films_are_told_apart_from_track_files_and_spreadsheets(film: Path, tmp_
     }
     for name, members in sheets.items():
         films.zip_of(tmp_path / name, dict.fromkeys(members, b""))
-    names = ("tracks.npz", "tracks.npy", "broken.zip", "missing.npz", *sheets)
+    names = ("tracks.npz", "tracks.npy", "broken.zip", "missing.npz", "still.png", *sheets)
     others = [tmp_path / name for name in names]
     assert [path for path in others if looks_like_film(path)] == []
 

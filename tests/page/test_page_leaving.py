@@ -61,6 +61,16 @@ def test_a_job_left_while_its_film_loads_opens_no_viewer(page: Page, url: str, f
     assert page.evaluate("document.body.dataset.opened ?? null") is None
 
 
+def test_a_long_name_of_another_job_does_not_widen_the_controls(page: Page, url: str, finished: str) -> None:
+    fake = record(url, finished, id=OTHER, name="x" * 200)
+    page.route(re.compile(r"/v1/jobs\?"), lambda route: route.fulfill(json={"jobs": [fake], "next": None}))
+    page.goto(f"{url}/#job={finished}")
+    compare = page.get_by_label("Compare with")
+    expect(compare.locator("option")).to_have_count(2, timeout=DONE)
+    right = "(it) => it.getBoundingClientRect().right"
+    assert compare.evaluate(right) <= page.locator(".tools").evaluate(right)
+
+
 def test_only_what_is_still_wanted_is_added_to_the_viewer(page: Page, url: str, finished: str) -> None:
     fake = record(url, finished, id=OTHER, name="the other")
     page.route(re.compile(r"/v1/jobs\?"), lambda route: route.fulfill(json={"jobs": [fake], "next": None}))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from pliant.solver import KnownCamera, Outcome, Settings, Step, Tracks, gallery, solve
 from pliant.solver.cameras.factorization import refine_factor
+from pliant.solver.isometry import surface
 from pliant.solver.model import expectation_maximisation
 from pliant.solver.monitor import PACE_PRIOR, Monitor
 from pliant.solver.pulse import pulse, pulses_to
@@ -226,6 +227,26 @@ def test_a_lower_tolerance_is_planned_with_more_units() -> None:
     assert [shapes(tolerance).units for tolerance in (1e-2, 1e-4, 1e-8)] == [28, 55, 110]
     assert shapes(1e-8).seconds == pytest.approx(2 * shapes(1e-4).seconds)
     assert shapes(0.999).units == 1
+
+
+@pytest.mark.parametrize("frames", [20, 30])
+def test_choosing_anchors_in_all_frames_is_a_stage_of_its_own(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = planned(frames, 60, gaussian=True, known_cameras=False, sheet=True)
+    monitor, seen = Monitor(plan=plan), list[tuple[str, int]]()
+
+    def prepared(points: np.ndarray, confidence: np.ndarray, centre: np.ndarray, should_stop: object) -> object:
+        seen.append((monitor.current.name, len(points)))
+        return object()
+
+    monkeypatch.setattr(surface, "_prepared", prepared)
+    monkeypatch.setattr(surface, "_implausible", lambda search, focal, required: None)
+    surface._search(gallery.flag(frames, 60).tracks, np.zeros(2), 500.0, False, monitor)
+    assert seen == ([("surface", 20)] if frames == 20 else [("first_look", 24), ("anchors", 30)])
+    assert monitor.current.name == "surface"
+    times = {
+        stage.name: stage.seconds for stage in planned(10 * frames, 60, gaussian=True, known_cameras=False, sheet=True)
+    }
+    assert times["anchors"] == pytest.approx(0.1 * frames)
 
 
 class Clock:

@@ -54,6 +54,24 @@ def test_regions_are_read_from_masks_polygons_and_files(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_region(str(tmp_path / "clear.png"), (64, 48)), mask)
 
 
+def test_an_outline_that_runs_around_twice_leaves_no_hole() -> None:
+    size = (64, 48)
+    first, second = [(10, 10), (40, 10), (40, 30), (10, 30)], [(20, 20), (50, 20), (50, 40), (20, 40)]
+    either = read_region(first, size) | read_region(second, size)
+    whole = [*first, first[0], *second, second[0]]
+    for twice in (whole, whole[::-1]):
+        covered = read_region(twice, size)
+        assert covered[either].all()
+        assert covered[20:31, 20:41].all()  # inside both
+        assert (covered & ~either).sum() <= 20  # beside the way from one to the other
+    beyond = [(x - 30, y - 20) for x, y in first]
+    np.testing.assert_array_equal(read_region(beyond * 2, size), read_region(beyond, size))
+    inner = [(20, 15), (20, 25), (30, 25), (30, 15)]  # the other way round: a ring
+    ring = read_region([*first, first[0], *inner, inner[0]], size)
+    assert not ring[16:25, 21:30].any()
+    assert ring[12, 12:39].all()
+
+
 def disc(share: float, *, blur: float = 0.0) -> Image.Image:
     """Return an anti-aliased white disc on black, `share` of the picture's height across, blurred by a share of its width."""
     width, height = 320, 240

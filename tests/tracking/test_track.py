@@ -249,6 +249,16 @@ def test_only_the_templates_shot_is_tracked(tmp_path: Path) -> None:
     assert tracked.visibility.mean() > 0.9
 
 
+def test_a_cut_is_told_before_the_shot_is_refused_for_its_texture(tmp_path: Path) -> None:
+    black = [np.zeros((72, 96, 3), np.uint8)] * 8
+    path = films.write_film(tmp_path / "film.mkv", [*black, *films.textured_pictures(12, (96, 72))])
+    told: list[list[str]] = []
+    with pytest.raises(FilmError) as caught:
+        track_film(path, region=[(20, 20), (70, 20), (70, 55)], grid_step=4, on_warnings=told.append)
+    assert caught.value.code == "no_texture"
+    assert told[-1][0].startswith("The film has a cut (at frame 8). Only frames 0 to 7 are tracked.")
+
+
 def test_a_still_film_gets_a_warning(tmp_path: Path) -> None:
     random, (picture,) = np.random.default_rng(0), films.textured_pictures(1, (96, 72))
     noisy = [np.clip(picture + random.normal(0, 2, picture.shape), 0, 255).astype(np.uint8) for _ in range(12)]

@@ -86,12 +86,11 @@ def reconstruct_film(
         artifacts = [_moved(scratch / name, directory) for name in FILES if (scratch / name).exists()]
         finished = solve_and_write(
             inputs, options, directory, reporter=reporter, halt=halt, name=name, spent=spent,
-            earlier=artifacts, warnings=tracked.warnings,
+            earlier=artifacts,
         )  # fmt: skip
     return replace(
         finished,
         artifacts=(*artifacts, *finished.artifacts),
-        warnings=(*tracked.warnings, *finished.warnings),
         interpretation=inputs.interpretation,
         options=options,
     )

@@ -65,13 +65,12 @@ def solve_and_write(
     name: str = "",
     spent: Mapping[str, float] | None = None,
     earlier: Sequence[Artifact] = (),
-    warnings: Sequence[str] = (),
     solver: Callable[..., Solution] | None = None,
 ) -> Finished:
     """Run `reconstruct` as part of a longer job.
 
-    The reporter receives the parts `loading`, `solving` and `exporting`. `spent` (seconds), `earlier` (files in the same
-    directory) and `warnings` come from earlier parts and are included in the report.
+    The reporter receives the parts `loading`, `solving` and `exporting`. `spent` (seconds) and `earlier` (files in the
+    same directory) come from earlier parts and are included in the report.
     """
     directory.mkdir(parents=True, exist_ok=True)
     size = inputs.tracks.num_frames, inputs.tracks.num_points
@@ -94,7 +93,7 @@ def solve_and_write(
     seconds = {**(spent or {}), "solve": solved - began, "metrics": time.perf_counter() - solved}
     report = build_report(inputs, solution, options, metrics=metrics, seconds=seconds, name=name)
     of_files = file_warnings(options, solution)
-    report["warnings"] = [*warnings, *report["warnings"], *of_files]
+    report["warnings"] = [*inputs.warnings, *report["warnings"], *of_files]
     report["artifacts"] = {each.name: {"bytes": each.bytes, "sha256": each.sha256} for each in earlier}
 
     def exported(done: float) -> None:
@@ -104,7 +103,7 @@ def solve_and_write(
     artifacts = write_artifacts(inputs, solution, options, report, directory, name=name, on_progress=exported)
     exported(1.0)
     done = _finished(solution, metrics, artifacts, camera_sentence=report["camera"]["sentence"])
-    return replace(done, warnings=(*done.warnings, *of_files))
+    return replace(done, warnings=(*inputs.warnings, *done.warnings, *of_files))
 
 
 def _finished(

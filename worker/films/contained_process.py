@@ -11,6 +11,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,6 +39,9 @@ FOLLOWED_POINTS = 150
 
 SHARES = {"read": (0.0, 0.15), "locate": (0.15, 0.25), "track": (0.25, 1.0)}
 """Start and end of each stage of the tracker, as fractions of the tracking time, from typical timings."""
+
+LOOKED = 1 / 3
+"""Share of the check's time after which two frames that differ are no longer looked for: a film may begin with a still picture."""
 
 PICTURE_SIDE, PICTURE_QUALITY = 800, 80
 """Longest side in pixels and JPEG quality of the first frame in the answer: about 0.1 MB, at most 0.5 MB."""
@@ -87,7 +91,7 @@ def _answer(request: dict[str, Any]) -> str:
 
 
 def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
-    """Open the film, decode its first frame, read the region, and check the options against both."""
+    """Open the film, decode it up to two frames that differ, read the region, and check the options against both."""
     from pliant.tracking import FilmError, open_film
     from pliant.tracking.decoding.film import LEAST_FRAMES
     from pliant.tracking.planning.options import check_against
@@ -102,8 +106,13 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
             "too_many_frames", field="film", expected=f"at most {bounds.max_frames} frames", got=str(count),
             hint="Select some with frames, for example 0:3000:2.",
         )  # fmt: skip
-    if next(film.frames(), None) is None or (count is not None and count < LEAST_FRAMES):
-        raise film.too_few_frames(count or 0)
+    with closing(film.frames()) as frames:
+        first = next(frames, None)
+        if first is None or (count is not None and count < LEAST_FRAMES):
+            raise film.too_few_frames(count or 0)
+        for frame in frames:  # raises an error if all are equal, as those of an interlaced film are
+            if not np.array_equal(frame.image, first.image) or time.process_time() > LOOKED * bounds.check_seconds:
+                break
     region = _region(request)
     if region is not None:
         read_region(region, film.size)
@@ -120,8 +129,8 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
         from pliant.tracking.estimate import estimate
 
         expected = estimate(
-            film, region=region, region_frame=options["region_frame"], grid_step=options["grid_step"],
-            longest_side=options["longest_side"], threads=request["threads"],
+            film, region=region, region_frame=options["region_frame"], template_frame=options["template_frame"],
+            grid_step=options["grid_step"], longest_side=options["longest_side"], threads=request["threads"],
         )  # fmt: skip
         facts |= {"points": expected.points, "track_seconds": expected.seconds}
     if request["picture"]:

@@ -63,5 +63,13 @@ def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
         texture = Texture.from_tracked(arrays["template_image"], np.clip(arrays["uv"], 0, 1)).at_points(kept)
     times = read_frame_times(arrays, checked.num_frames, field="film")
     return Inputs(
-        checked, mesh, None, None, stated, selection if selection.narrows else None, texture=texture, frame_times=times
+        checked,
+        mesh,
+        None,
+        None,
+        stated,
+        selection if selection.narrows else None,
+        texture=texture,
+        frame_times=times,
+        warnings=tracked.warnings,
     )

@@ -56,10 +56,11 @@ def looks_like_film(path: Path) -> bool:
         return True
     try:
         with path.open("rb") as file:
-            head = file.read(16)
+            head = file.read(4096)
     except OSError:
         return path.suffix.lower() in SUFFIXES
-    if film_kind(head) is not None:
+    animated = head.startswith(b"\x89PNG") and b"acTL" in head  # refused, with advice for films
+    if film_kind(head) is not None or animated:
         return True
     if head.startswith(b"PK") and path.suffix.lower() != ".npz":
         return _holds_pictures(path)

@@ -15,6 +15,8 @@ from pliant.worker.formats.point_names import pack, unpack
 from pliant.worker.formats.reading.arrays import read_file
 from pliant.worker.formats.records import Arrays, GroundTruth, Inputs, Limits, Selection
 from pliant.worker.formats.texture import Texture
+from pliant.worker.formats.tracker_warnings import ARRAY as WARNINGS
+from pliant.worker.formats.tracker_warnings import read_warnings
 from pliant.worker.formats.tracks.frame_times import ARRAY as TIMES
 from pliant.worker.formats.tracks.frame_times import read_frame_times
 
@@ -54,6 +56,8 @@ def save_inputs(inputs: Inputs, path: Path) -> None:
         arrays[NAMES] = pack(inputs.point_names)
     if inputs.frame_times is not None:
         arrays[TIMES] = inputs.frame_times
+    if inputs.warnings:
+        arrays[WARNINGS] = np.array(inputs.warnings)
     with path.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
 
@@ -66,7 +70,7 @@ def load_inputs(path: Path) -> Inputs:
     InvalidInput
         Code damaged_file: `save_inputs` did not write this file, or it was damaged.
     """
-    arrays = read_file(path, field="inputs", limits=OWN_FILES)
+    arrays = read_file(path, field="inputs", limits=OWN_FILES, texts=(WARNINGS,))
     missing = {"version", "points", "visible", "interpretation"} - set(arrays)
     if missing or int(arrays["version"]) != VERSION:
         raise damaged(
@@ -92,6 +96,7 @@ def load_inputs(path: Path) -> Inputs:
     return Inputs(
         Tracks(points, _wide(arrays["visible"])), mesh, truth, cameras, interpretation, selection, _texture(arrays),
         unpack(arrays.get(NAMES), points.shape[1]), read_frame_times(arrays, len(points), field="inputs"),
+        read_warnings(arrays, field="inputs"),
     )  # fmt: skip
 
 

@@ -71,11 +71,20 @@ def stated(array: NDArray[np.generic], count: int) -> tuple[str, ...]:
             "wrong_shape", field=field, expected=f"({count},), one name for each point", got=str(array.shape),
             hint="Give as many names as the tracks have points, or leave them out.",
         )  # fmt: skip
+    return tuple(_clean(each) for each in decoded(array, field))
+
+
+def decoded(array: NDArray[np.generic], field: str) -> list[str]:
+    """Return a one-dimensional NumPy array of strings as a list.
+
+    Raises
+    ------
+    InvalidInput
+        Code damaged_file: strings that are not Unicode.
+    """
     if array.dtype.kind == "U" and (np.ascontiguousarray(array).view(np.uint32) > sys.maxunicode).any():
         raise damaged(field, "texts that are not Unicode")
-    return tuple(
-        _clean(each.decode("utf-8", "replace") if isinstance(each, bytes) else each) for each in array.tolist()
-    )
+    return [each.decode("utf-8", "replace") if isinstance(each, bytes) else each for each in array.tolist()]
 
 
 def unpack(array: NDArray[np.generic] | None, count: int) -> tuple[str, ...] | None:

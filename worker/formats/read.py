@@ -95,6 +95,7 @@ def read_inputs(
         texture=texture,
         point_names=names,
         frame_times=times,
+        warnings=() if film is None else film.warnings,
     )
 
 

@@ -161,3 +161,6 @@ class Inputs:
 
     frame_times: NDArray[np.float64] | None = None
     """Seconds of every frame of a film, shape `(F,)`, increasing; None for other tracks."""
+
+    warnings: tuple[str, ...] = ()
+    """The tracker's warnings about the film."""

@@ -170,7 +170,8 @@ export class RegionDialog {
   }
 
   private begin(event: PointerEvent): void {
-    if (event.button !== 0 || !event.isPrimary) return;
+    if (!event.isPrimary) return this.abandon(); // two fingers pinch or scroll
+    if (event.button !== 0) return;
     this.canvas.setPointerCapture(event.pointerId);
     this.stroke = [this.at(event)];
   }

@@ -100,10 +100,12 @@ export function paint(canvas: HTMLCanvasElement, picture: ImageBitmap, outline: 
   for (const [x, y] of outline) path.lineTo(x * scale, y * scale);
   if (isClosed) {
     path.closePath();
-    const outside = new Path2D(path);
-    outside.rect(0, 0, canvas.width, canvas.height);
     context.fillStyle = "rgb(0 0 0 / 0.5)";
-    context.fill(outside, "evenodd");
+    context.fillRect(0, 0, canvas.width, canvas.height);
+    context.save();
+    context.clip(path); // also what the outline runs around twice
+    context.drawImage(picture, 0, 0, canvas.width, canvas.height);
+    context.restore();
   }
   // A light line on a dark one is visible on every picture.
   const width = Math.max(2, canvas.width / 320);

@@ -62,6 +62,19 @@ def test_a_region_drawn_with_the_mouse_is_sent_with_the_film(
     assert corners.max(0) == pytest.approx([0.8 * WIDTH, 0.8 * HEIGHT], abs=2)
 
 
+def test_a_lasso_that_runs_around_twice_leaves_no_hole(filming: Page, films: dict[str, bytes]) -> None:
+    drop(filming, {"film.webm": films["film.webm"]})
+    filming.get_by_role("button", name="Draw a region").click()
+    read = "(it) => [...it.getContext('2d').getImageData(it.width / 2, it.height / 2, 1, 1).data].slice(0, 3)"
+    canvas = filming.get_by_role("application")
+    undimmed = canvas.evaluate(read)
+    around = ((0.2, 0.2), (0.8, 0.2), (0.8, 0.8), (0.2, 0.8), (0.2, 0.25))
+    drag(filming, *around, *((x + 0.05, y + 0.05) for x, y in around))
+    expect(filming.get_by_role("dialog").get_by_role("status")).to_contain_text("Lasso with")
+    assert canvas.evaluate(read) == pytest.approx(undimmed, abs=2)
+    filming.get_by_role("button", name="Cancel").click()
+
+
 def test_a_region_is_drawn_after_a_drag_from_outside_has_selected_text(filming: Page, films: dict[str, bytes]) -> None:
     drop(filming, {"film.webm": films["film.webm"]})
     filming.get_by_role("button", name="Draw a region").click()
@@ -324,6 +337,15 @@ def test_a_region_can_be_drawn_by_touch(filming: Page, films: dict[str, bytes]) 
     status = filming.get_by_role("dialog").get_by_role("status")
     expect(status).to_contain_text("Lasso with")
     expect(status).to_contain_text("160 × 132 pixels")
+
+    touch("touchStart", (0.5, 0.5))  # a second finger ends the stroke, which changes nothing
+    touch("touchStart", (0.5, 0.5), (0.6, 0.55))
+    for step in (0.05, 0.1, 0.15):
+        touch("touchMove", (0.5 - step, 0.5 - step), (0.6 + step, 0.55 + step))
+    touch("touchEnd")
+    expect(status).to_contain_text("160 × 132 pixels")
+    filming.get_by_role("button", name="Undo").click()
+    expect(status).to_contain_text("No region")
 
 
 @pytest.mark.parametrize(("width", "scheme"), BOTH_WIDTHS_AND_THEMES)

@@ -32,7 +32,7 @@ def film_arrays() -> dict[str, np.ndarray]:
         "tracks": tracks.astype(np.float32), "visibility": visible, "confidence": confidence.astype(np.float32), "grid": grid,
         "uv": ((start + 0.5) / (64, 48)).astype(np.float32), "template": np.array(0), "fps": np.array(24.0),
         "template_image": random.integers(0, 256, (48, 64, 3), dtype=np.uint8), "image_size": np.array([64, 48]),
-        "frame_indices": np.arange(FRAMES), "frame_times": np.arange(FRAMES) / 24,
+        "frame_indices": np.arange(FRAMES), "frame_times": np.arange(FRAMES) / 24, "warnings": np.array(["Only 5 frames are tracked."]),
     }  # fmt: skip
 
 
@@ -79,6 +79,7 @@ def test_every_array_of_the_tracker_is_used(tmp_path: Path) -> None:
     assert back.texture == inputs.texture or back.texture.jpeg == inputs.texture.jpeg  # type: ignore[union-attr]
     for held in (inputs, back):
         np.testing.assert_array_equal(held.frame_times, given["frame_times"])
+        assert held.warnings == ("Only 5 frames are tracked.",)
 
 
 def test_options_and_a_given_mesh_override_the_file(tmp_path: Path) -> None:
@@ -148,6 +149,10 @@ def test_a_film_process_that_leaves_out_the_times_is_not_believed(tmp_path: Path
         ({"frame_times": np.array([0.0, 1.0, 1.0, 2.0, 3.0])}, "frame_times that do not increase"),
         ({"frame_times": np.array([0.0, 1.0, np.nan, 2.0, 3.0])}, "frame_times that do not increase"),
         ({"frame_times": np.array([0.0, 1.0, 2.0, 3.0, 1e300])}, "frame_times over 1e\\+300 seconds"),
+        ({"warnings": np.array("one")}, "warnings of shape \\(\\) and type"),
+        ({"warnings": np.array(["much"] * 101)}, "warnings of shape \\(101,\\)"),
+        ({"warnings": np.array(["a" * 1001])}, "warnings of shape \\(1,\\) and type <U1001"),
+        ({"warnings": np.array([0x110000], np.uint32).view("U1")}, "not Unicode"),
         ({"uv": np.zeros((3, 2), np.float32)}, "texture coordinates"),
         ({"template_image": np.zeros((4, 4), np.uint8)}, "template_image"),
         ({"template_image": np.zeros((1, 65_501, 3), np.uint8)}, "template_image"),  # too wide for a JPEG

@@ -308,6 +308,11 @@ REFUSED: dict[str, tuple[bytes, str, str]] = {
         "tracks: expected point tracks over several frames, got a single picture (png). "
         "Depth comes from motion: send a film, or a zip of all its pictures, as the film.",
     ),
+    "a picture in another format": (
+        b"RIFF\0\0\0\0WEBPVP8X" + bytes(600), "picture_as_tracks",
+        "tracks: expected point tracks over several frames, got a single picture (webp). "
+        "Depth comes from motion: send a film, or a zip of all its pictures, as the film.",
+    ),
     "a spreadsheet": (
         spreadsheet("xl/workbook.xml", "xl/worksheets/sheet1.xml", "[Content_Types].xml"), "unknown_format",
         f"{UNKNOWN} a spreadsheet (xlsx). {AS_CSV}",

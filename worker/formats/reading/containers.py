@@ -13,6 +13,7 @@ from pliant.worker.formats.reading.arrays import NPY_MAGIC, read_file, shapes_of
 from pliant.worker.formats.reading.parsers import recognise
 from pliant.worker.formats.reading.sandbox import parse_in_sandbox
 from pliant.worker.formats.records import Arrays, Limits
+from pliant.worker.formats.tracker_warnings import ARRAY as WARNINGS
 
 ZIP = (b"PK\x03\x04", b"PK\x05\x06")
 
@@ -35,7 +36,7 @@ def read_arrays(path: Path, *, field: str, limits: Limits, wanted: Collection[st
             "empty_file", field=field, expected="a file with content", got="0 bytes", hint="Send the file again."
         )
     if head.startswith((NPY_MAGIC, *ZIP)):
-        return read_file(path, field=field, limits=limits, wanted=wanted, texts=(NAMES,))
+        return read_file(path, field=field, limits=limits, wanted=wanted, texts=(NAMES, WARNINGS))
     return parse_in_sandbox(recognise(head, field), path, field=field, limits=limits)
 
 

@@ -171,6 +171,8 @@ def _refuse_pictures(head: bytes) -> None:
     if kind is not None:
         raise film_as_tracks(f"a film ({kind})")
     kind = next((name for start, name in PICTURES.items() if head.startswith(start)), None)
+    if head.startswith(b"RIFF") and head[8:12] == b"WEBP":
+        kind = "webp"
     if kind is not None:
         raise InvalidInput(
             "picture_as_tracks", field="tracks", expected="point tracks over several frames", got=f"a single picture ({kind})",

@@ -15,6 +15,8 @@ from pliant.worker.formats.errors import damaged
 from pliant.worker.formats.reading.containers import read_arrays
 from pliant.worker.formats.records import Arrays, Limits
 from pliant.worker.formats.texture import Texture
+from pliant.worker.formats.tracker_warnings import ARRAY as WARNINGS
+from pliant.worker.formats.tracker_warnings import read_warnings
 from pliant.worker.formats.tracks.frame_times import ARRAY as TIMES
 from pliant.worker.formats.tracks.frame_times import mean_rate, read_frame_times
 
@@ -47,6 +49,9 @@ class FilmTracks:
     texture: Texture | None
     """The template frame with texture coordinates; None if they were removed from the file."""
 
+    warnings: tuple[str, ...]
+    """The tracker's warnings about the film."""
+
     def rate(self, frames: NDArray[np.intp]) -> float:
         """Return the frames per second of some of the frames, by their increasing indices."""
         if self.times is None:
@@ -62,7 +67,9 @@ def read_film_tracks(path: Path, *, shape: tuple[int, int], limits: Limits) -> F
     InvalidInput
         Code damaged_file if an array is missing or does not fit the tracks, and the codes of `read_arrays` and `Mesh`.
     """
-    arrays = read_arrays(path, field="tracks", limits=limits, wanted=frozenset((*REQUIRED, TIMES, *TEXTURE_ARRAYS)))
+    arrays = read_arrays(
+        path, field="tracks", limits=limits, wanted=frozenset((*REQUIRED, TIMES, WARNINGS, *TEXTURE_ARRAYS))
+    )
     missing = [name for name in REQUIRED if name not in arrays]
     if missing:
         raise damaged("tracks", f"tracks of a film without {', '.join(missing)}")
@@ -80,7 +87,8 @@ def read_film_tracks(path: Path, *, shape: tuple[int, int], limits: Limits) -> F
     if all(name in arrays for name in TEXTURE_ARRAYS):
         texture = _texture(arrays, shape[1])
     visible = np.where(arrays["visibility"].astype(bool), confidence, 0.0)
-    return FilmTracks(visible, mesh, size, fps, read_frame_times(arrays, shape[0], field="tracks"), texture)
+    times, warnings = read_frame_times(arrays, shape[0], field="tracks"), read_warnings(arrays, field="tracks")
+    return FilmTracks(visible, mesh, size, fps, times, texture, warnings)
 
 
 def tracks_options(options: Options, interpretation: Interpretation) -> Options:
