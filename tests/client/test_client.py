@@ -72,6 +72,25 @@ def test_headers_and_event_hooks_apply_to_every_request() -> None:
     assert hooked == ["/v1/options"]
 
 
+@pytest.mark.parametrize(
+    ("headers", "words"),
+    [
+        ({"X-Team": "Bühne"}, "printable ASCII .* for X-Team, got another value. Encode"),
+        ({"X-Team": "a\nb"}, "printable ASCII .* for X-Team"),
+        ({"X-Team": " a"}, "without spaces around it, for X-Team"),
+        ({"X-Team": 5}, "expected a str .* for X-Team"),
+        ({"Bühne": "a"}, "expected names of ASCII .* got 'Bühne'"),
+        ({"X Team": "a"}, "expected names of ASCII .* got 'X Team'"),
+        ({5: "a"}, "expected names of ASCII .* got 5"),
+        ([("X-Team", "a")], "expected a mapping of str to str, got a value of type list"),
+    ],
+)
+def test_headers_that_http_does_not_allow_are_refused_in_words(headers: Any, words: str) -> None:
+    with pytest.raises(BadArgument, match=f"headers: .*{words}"):
+        Client(headers=headers, transport=ECHO)
+    assert sent(Client(headers={"X-Team": "", "x_1.~": "a b;c"}, transport=ECHO)).headers["x_1.~"] == "a b;c"
+
+
 def test_the_asynchronous_client_takes_asynchronous_hooks() -> None:
     hooked: list[str] = []
 
