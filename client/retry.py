@@ -70,6 +70,11 @@ class Retry:
     jitter: Callable[[], float] = random.random
     """Returns a factor in [0, 1) for each pause, which spreads the retries of many clients."""
 
+    def __post_init__(self) -> None:
+        for name in ("patience", "first_contact", "shortest_pause", "longest_pause", "long_poll", "poll_interval"):
+            if _seconds(getattr(self, name), name) < 0:
+                raise BadArgument(f"{name}: expected at least 0 seconds, got {getattr(self, name)!r}.")
+
 
 @dataclass(kw_only=True)
 class Contact:
@@ -101,7 +106,7 @@ class Attempts:
 
     def __post_init__(self) -> None:
         if self.timeout is not None:
-            self.timeout = _seconds(self.timeout)
+            self.timeout = _seconds(self.timeout, "timeout")
         self.deadline = math.inf if self.timeout is None else self.retries.clock() + self.timeout
 
     def remaining(self) -> float:
@@ -193,14 +198,14 @@ class Attempts:
         )
 
 
-def _seconds(timeout: object) -> float:
-    """Return a timeout, which may be a number of NumPy, as a float."""
+def _seconds(given: object, name: str) -> float:
+    """Return a time, which may be a number of NumPy, as a float."""
     try:
-        seconds = float(timeout) if isinstance(timeout, SupportsFloat) and not isinstance(timeout, bool) else math.nan
+        seconds = float(given) if isinstance(given, SupportsFloat) and not isinstance(given, bool) else math.nan
     except (TypeError, ValueError):  # an array
         seconds = math.nan
     if math.isnan(seconds):
-        raise BadArgument(f"timeout: expected seconds as a number, or None, got {timeout!r}.")
+        raise BadArgument(f"{name}: expected seconds as a number, got {given!r}.")
     return seconds
 
 

@@ -484,3 +484,16 @@ def test_an_input_error_has_all_its_fields(clock: Clock) -> None:
     assert problem.field == "tracks"
     assert "(frames, points, 2)" in str(problem.expected)
     assert "(5, 9)" in str(problem.got)
+
+
+@pytest.mark.parametrize(
+    "name", ["patience", "first_contact", "shortest_pause", "longest_pause", "long_poll", "poll_interval"]
+)
+def test_a_time_that_is_negative_or_no_number_is_refused(name: str) -> None:
+    with pytest.raises(BadArgument, match=f"{name}: expected at least 0 seconds, got -1"):
+        Retry(**{name: -1})
+    wrong: Any
+    for wrong in (math.nan, None, "5 s"):
+        with pytest.raises(BadArgument, match=f"{name}: expected seconds as a number, got"):
+            Retry(**{name: wrong})
+    assert Retry(**{name: np.float32(0.5)}) == Retry(**{name: 0.5})
