@@ -103,6 +103,10 @@ def mesh_part(mesh: Source | tuple[int, int], folder: Path) -> Path | str:
         return existing_file(mesh, "mesh")
     if isinstance(mesh, Mapping):
         return _npz(folder / "mesh.npz", {str(key): _array(value, str(key)) for key, value in mesh.items()})
+    if hasattr(mesh, "faces"):
+        raise BadArgument(
+            f"mesh: expected faces (T, 3) or (T, 4), got {kind_of(mesh)}. Give its faces, such as mesh.faces, as an array, or a file."
+        )
     faces = _array(mesh, "mesh")
     if faces.shape == (2,) and faces.dtype.kind in "iu":  # a tuple, a list or an array; faces have two axes
         return f"{faces[0]}x{faces[1]}"
