@@ -272,3 +272,4 @@ def test_an_array_that_is_no_pair_is_refused_in_words(wrong: Any) -> None:
 
 def test_every_outcome_has_a_sentence() -> None:
     assert all(outcome.sentence.endswith(".") for outcome in Outcome)
+    assert "a tolerance above the rounding errors" in Outcome.REJECTED.sentence
