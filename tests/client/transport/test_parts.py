@@ -56,8 +56,20 @@ def test_an_array_keeps_its_dtype_and_stores_its_visibility(tmp_path: Path) -> N
 def test_masked_array_entries_become_hidden_points(tmp_path: Path) -> None:
     mask = np.zeros(POINTS.shape, bool)
     mask[1, 2, 0] = True
-    held = arrays(tracks_file(np.ma.masked_array(POINTS, mask), None, tmp_path))
-    assert np.argwhere(~held["visibility"]).tolist() == [[1, 2]]
+    masked = np.ma.masked_array(POINTS, mask)
+    confidence = np.ma.masked_array(np.ones((4, 9), bool), mask[..., 0])
+    for given, visible in ((masked, None), (masked, np.ones((4, 9))), ({"tracks": masked}, None)):
+        held = arrays(tracks_file(given, visible, tmp_path))
+        assert np.argwhere(np.isnan(held["tracks"]).any(axis=2)).tolist() == [[1, 2]]
+        assert held["tracks"].dtype == np.float32
+    held = arrays(tracks_file(POINTS, confidence, tmp_path))
+    assert np.argwhere(np.isnan(held["visibility"])).tolist() == [[1, 2]]
+    reading = Client("http://pliant.test", transport=InMemoryService()).inspect(POINTS, visible=confidence)
+    assert reading.hidden_fraction == 1 / 36
+    assert (
+        arrays(tracks_file(np.ma.masked_array(np.arange(72).reshape(4, 9, 2)), None, tmp_path))["tracks"].dtype.kind
+        == "i"
+    )
 
 
 def test_the_dictionary_of_a_tracker_is_sent_unchanged(tmp_path: Path) -> None:
