@@ -192,10 +192,20 @@ class Attempts:
         """Return the error that the caller sees after the last attempt."""
         if isinstance(fault, PliantError):
             return fault
+        advice = "Check the address, and that `pliant up` is running there."
+        if _proxied(self.contact.url):
+            advice += " Requests go to the proxy in HTTP_PROXY, HTTPS_PROXY or ALL_PROXY, unless NO_PROXY lists the service's host."
         return Unreachable(
-            f"No answer from the service at {self.contact.url}: {str(fault) or type(fault).__name__}. "
-            "Check the address, and that `pliant up` is running there."
+            f"No answer from the service at {self.contact.url}: {str(fault) or type(fault).__name__}. {advice}"
         )
+
+
+def _proxied(url: str) -> bool:
+    """Return True if the environment names a proxy for an address, as httpx reads it."""
+    from urllib.request import getproxies, proxy_bypass  # here, because it is not needed otherwise
+
+    address = httpx.URL(url)
+    return not getproxies().keys().isdisjoint((address.scheme, "all")) and not proxy_bypass(address.host)
 
 
 def _seconds(given: object, name: str) -> float:

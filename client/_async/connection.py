@@ -42,14 +42,25 @@ class AsyncConnection:
             raise BadArgument(f"retries: expected a Retry, such as Retry(patience=10), got {retries!r}.")
         self.url = base_of(url if url is not None else os.environ.get("PLIANT_URL") or DEFAULT_URL)
         bearer = token if token is not None else os.environ.get("PLIANT_TOKEN") or None
-        self._http = httpx.AsyncClient(
-            base_url=self.url,
-            headers=headers_of(bearer, headers),
-            verify=verify,
-            limits=UNLIMITED,
-            event_hooks=event_hooks,
-            transport=transport,
-        )
+        every = headers_of(bearer, headers)
+        try:
+            self._http = httpx.AsyncClient(
+                base_url=self.url,
+                headers=every,
+                verify=verify,
+                limits=UNLIMITED,
+                event_hooks=event_hooks,
+                transport=transport,
+            )
+        except (
+            ImportError,
+            OSError,
+            ValueError,
+        ) as fault:  # a SOCKS proxy, a file of certificates, the address of a proxy
+            raise BadArgument(
+                f"The connections cannot be set up: {str(fault).rstrip('.')}. Check verify and the environment variables HTTP_PROXY, "
+                "HTTPS_PROXY, ALL_PROXY, NO_PROXY, SSL_CERT_FILE and SSL_CERT_DIR."
+            ) from fault
         self._retries = retries
         self._contact = Contact(url=self.url)
 

@@ -12,7 +12,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from pliant.client import AsyncClient, BadArgument, Client, NotLoaded, Result
+from pliant.client import AsyncClient, BadArgument, Client, NotLoaded, Result, Retry, Unreachable
 from pliant.service.testing import InMemoryService
 
 
@@ -103,6 +103,34 @@ def test_the_asynchronous_client_takes_asynchronous_hooks() -> None:
 
     asyncio.run(use())
     assert hooked == ["/v1/options"]
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "words"),
+    [
+        ("HTTP_PROXY", "ftp://proxy.example", "Unknown scheme for proxy URL"),
+        ("ALL_PROXY", "socks5://proxy.example:1080", "SOCKS proxy"),
+        ("SSL_CERT_FILE", "/missing/certificates.pem", "No such file"),
+    ],
+)
+@pytest.mark.parametrize("kind", [Client, AsyncClient])
+def test_variables_that_httpx_cannot_use_are_named(
+    monkeypatch: pytest.MonkeyPatch, kind: type[Client], variable: str, value: str, words: str
+) -> None:
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(BadArgument, match=f"connections cannot be set up: .*{words}.* {variable}"):
+        kind("http://pliant.example")
+
+
+def test_the_error_about_an_unreachable_service_names_a_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("http_proxy", "all_proxy", "ALL_PROXY", "no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HTTP_PROXY", "http://127.0.0.1:1")
+    for excepted, named in (("", True), ("127.0.0.1", False)):
+        monkeypatch.setenv("NO_PROXY", excepted)
+        with pytest.raises(Unreachable, match="`pliant up` is running there") as caught:
+            Client("http://127.0.0.1:1", retries=Retry(first_contact=0)).limits()
+        assert ("NO_PROXY" in str(caught.value)) is named
 
 
 def test_verify_reaches_httpx(monkeypatch: pytest.MonkeyPatch) -> None:
