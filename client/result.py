@@ -168,7 +168,8 @@ class Reconstruction:
         Returns
         -------
         matplotlib.figure.Figure
-            One set of axes per frame; the figure is neither shown nor saved.
+            One set of axes per frame; the figure is neither shown nor saved. Notebooks show it as the value of a cell after
+            ``%matplotlib inline``.
 
         Raises
         ------
