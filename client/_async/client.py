@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import secrets
 import tempfile
@@ -31,9 +30,14 @@ from pliant.client.retry import SUBMISSION
 from pliant.schemas.job import Inspection, Job, JobPage, Priority, ServiceLimits, Status
 from pliant.schemas.options import Options, Output
 from pliant.schemas.shares import Share
+from pydantic import RootModel
 
 JSON = "application/json"
 JSON_BODY = {"Content-Type": JSON}
+
+
+class Document(RootModel[Any]):
+    """JSON of any form."""
 
 
 class AsyncClient(AsyncConnection):
@@ -511,5 +515,5 @@ class AsyncClient(AsyncConnection):
                 raise
 
     async def _document(self, path: str, timeout: float | None) -> Any:
-        _, body = await self._exchange(timeout).answer(Call(method="GET", path=path, headers={"Accept": JSON}))
-        return json.loads(body)
+        call = Call(method="GET", path=path, headers={"Accept": JSON})
+        return (await self._exchange(timeout).record(call, Document)).root

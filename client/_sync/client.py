@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import secrets
 import tempfile
@@ -32,9 +31,14 @@ from pliant.client.retry import SUBMISSION
 from pliant.schemas.job import Inspection, Job, JobPage, Priority, ServiceLimits, Status
 from pliant.schemas.options import Options, Output
 from pliant.schemas.shares import Share
+from pydantic import RootModel
 
 JSON = "application/json"
 JSON_BODY = {"Content-Type": JSON}
+
+
+class Document(RootModel[Any]):
+    """JSON of any form."""
 
 
 class Client(Connection):
@@ -510,5 +514,5 @@ class Client(Connection):
                 raise
 
     def _document(self, path: str, timeout: float | None) -> Any:
-        _, body = self._exchange(timeout).answer(Call(method="GET", path=path, headers={"Accept": JSON}))
-        return json.loads(body)
+        call = Call(method="GET", path=path, headers={"Accept": JSON})
+        return (self._exchange(timeout).record(call, Document)).root

@@ -407,6 +407,8 @@ def test_a_response_of_another_server_is_an_error(clock: Clock) -> None:
         client_of(Flaky(page), clock).options()
     with pytest.raises(UnexpectedAnswer, match="Expected a Job with status 200"):
         client_of(Flaky(lambda request: httpx.Response(200, json={"hello": 1})), clock).get("a")
+    with pytest.raises(UnexpectedAnswer, match="Expected a Document with status 200, got '<h1>Welcome"):
+        client_of(Flaky(lambda request: httpx.Response(200, html="<h1>Welcome</h1>")), clock).ready()
     nonsense = {"content-type": "application/problem+json"}
     with pytest.raises(UnexpectedAnswer, match="cannot be read"):
         client_of(Flaky(lambda request: httpx.Response(500, content=b"{", headers=nonsense)), clock).get("a")
