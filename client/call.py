@@ -57,16 +57,16 @@ def base_of(url: str) -> str:
     Raises
     ------
     BadArgument
-        The text is not an http or https address.
+        The text is not an http or https address, or it has a query.
     """
     try:
         parsed = httpx.URL(url)
-        valid = parsed.scheme in ("http", "https") and parsed.host != ""
-    except httpx.InvalidURL:
+        valid = parsed.scheme in ("http", "https") and parsed.host != "" and not parsed.query
+    except (httpx.InvalidURL, TypeError):
         valid = False
     if not valid:
         raise BadArgument(f"Expected the address of a service such as http://127.0.0.1:8000, got {url!r}.")
-    return url.rstrip("/")
+    return str(url).rstrip("/")
 
 
 @cache

@@ -25,7 +25,7 @@ class AsyncConnection:
     """Base class of `AsyncClient`, which documents the parameters. Close it, or use it in a ``with`` block."""
 
     url: str
-    """Address of the service, without a slash at the end."""
+    """Address of the service, without user name and password, and without a slash at the end."""
 
     def __init__(
         self,
@@ -40,12 +40,13 @@ class AsyncConnection:
     ) -> None:
         if not isinstance(retries, Retry):
             raise BadArgument(f"retries: expected a Retry, such as Retry(patience=10), got {retries!r}.")
-        self.url = base_of(url if url is not None else os.environ.get("PLIANT_URL") or DEFAULT_URL)
+        address = base_of(url if url is not None else os.environ.get("PLIANT_URL") or DEFAULT_URL)
+        self.url = str(httpx.URL(address).copy_with(userinfo=b""))
         bearer = token if token is not None else os.environ.get("PLIANT_TOKEN") or None
         every = headers_of(bearer, headers)
         try:
             self._http = httpx.AsyncClient(
-                base_url=self.url,
+                base_url=address,
                 headers=every,
                 verify=verify,
                 limits=UNLIMITED,

@@ -26,7 +26,7 @@ class Connection:
     """Base class of `Client`, which documents the parameters. Close it, or use it in a ``with`` block."""
 
     url: str
-    """Address of the service, without a slash at the end."""
+    """Address of the service, without user name and password, and without a slash at the end."""
 
     def __init__(
         self,
@@ -41,12 +41,13 @@ class Connection:
     ) -> None:
         if not isinstance(retries, Retry):
             raise BadArgument(f"retries: expected a Retry, such as Retry(patience=10), got {retries!r}.")
-        self.url = base_of(url if url is not None else os.environ.get("PLIANT_URL") or DEFAULT_URL)
+        address = base_of(url if url is not None else os.environ.get("PLIANT_URL") or DEFAULT_URL)
+        self.url = str(httpx.URL(address).copy_with(userinfo=b""))
         bearer = token if token is not None else os.environ.get("PLIANT_TOKEN") or None
         every = headers_of(bearer, headers)
         try:
             self._http = httpx.Client(
-                base_url=self.url,
+                base_url=address,
                 headers=every,
                 verify=verify,
                 limits=UNLIMITED,

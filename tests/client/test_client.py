@@ -59,6 +59,21 @@ def test_an_empty_variable_counts_as_unset(monkeypatch: pytest.MonkeyPatch) -> N
         Client("")
 
 
+@pytest.mark.parametrize("url", ["http://pliant.example?x=1", "pliant.example", "ftp://pliant.example", 5])
+def test_what_is_no_address_is_refused(url: Any) -> None:
+    with pytest.raises(BadArgument, match="Expected the address of a service"):
+        Client(url)
+
+
+def test_a_password_in_the_address_is_sent_and_not_shown() -> None:
+    client = Client(httpx.URL("http://me:secret@pliant.example/base/"), transport=ECHO)  # type: ignore[arg-type]
+    assert sent(client).headers["authorization"].startswith("Basic ")
+    assert (client.url, repr(client)) == ("http://pliant.example/base", "<Client http://pliant.example/base>")
+    with pytest.raises(Unreachable) as caught:
+        Client("http://me:secret@127.0.0.1:1", retries=Retry(first_contact=0)).limits()
+    assert "secret" not in str(caught.value)
+
+
 def test_headers_and_event_hooks_apply_to_every_request() -> None:
     hooked: list[str] = []
     client = Client(
