@@ -208,7 +208,8 @@ class KnownCamera:
 
     scales: Floats | None = None
     """Shape `(F,)`, the tracks' unit per unit of the shapes; None estimates them if the camera model has scales. For a perspective
-    camera, φ divided by the depth of the shape's origin."""
+    camera, φ divided by the depth of the shape's origin, which is the mean of its points, not the origin of your world: with another
+    depth the shapes have another size."""
 
     focal: float | None = None
     """φ, the tracks' unit; None takes it from the settings."""
