@@ -184,7 +184,7 @@ class Attempts:
         if now + pause >= self.deadline:
             raise WaitTimeout(
                 f"The timeout of {self.timeout:g} s passed during {self.doing}; the last error was: "
-                f"{fault or type(fault).__name__}. {self._advice}"
+                f"{_words(fault)}. {self._advice}"
             ) from fault
         return pause
 
@@ -195,9 +195,12 @@ class Attempts:
         advice = "Check the address, and that `pliant up` is running there."
         if _proxied(self.contact.url):
             advice += " Requests go to the proxy in HTTP_PROXY, HTTPS_PROXY or ALL_PROXY, unless NO_PROXY lists the service's host."
-        return Unreachable(
-            f"No answer from the service at {self.contact.url}: {str(fault) or type(fault).__name__}. {advice}"
-        )
+        return Unreachable(f"No answer from the service at {self.contact.url}: {_words(fault)}. {advice}")
+
+
+def _words(fault: Exception) -> str:
+    """Return the message of an error without the period at its end; some errors of connections have none, only a type."""
+    return str(fault).rstrip(".") or type(fault).__name__
 
 
 def _proxied(url: str) -> bool:

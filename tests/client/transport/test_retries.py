@@ -401,6 +401,31 @@ def test_the_timeout_of_a_submission_also_ends_a_slow_upload(
     assert len(sent) == 3
 
 
+@pytest.mark.parametrize("status", [200, 400])
+def test_the_timeout_bounds_a_body_that_arrives_slowly(clock: Clock, status: int) -> None:
+    class Slow(httpx.SyncByteStream):
+        def __iter__(self) -> Iterator[bytes]:
+            for _ in range(100):
+                clock.now += 1
+                yield b" "
+
+    client = client_of(Flaky(lambda request: httpx.Response(status, stream=Slow())), clock)
+    with pytest.raises(WaitTimeout, match="The timeout of 3 s passed"):
+        client.limits(timeout=3)
+    assert clock.now == 3
+
+
+@pytest.mark.parametrize(("message", "words"), [("", "ReadError"), ("Server disconnected.", "Server disconnected")])
+def test_the_last_error_is_named_whether_or_not_it_has_a_message(clock: Clock, message: str, words: str) -> None:
+    def lost(request: httpx.Request) -> httpx.Response:
+        raise httpx.ReadError(message)
+
+    with pytest.raises(WaitTimeout, match=rf"the last error was: {words}\. Nothing"):
+        client_of(Flaky(*[lost] * 30), clock).limits(timeout=3)
+    with pytest.raises(Unreachable, match=rf"pliant\.test: {words}\. Check"):
+        client_of(Flaky(*[lost] * 30), clock).limits()
+
+
 def test_a_response_of_another_server_is_an_error(clock: Clock) -> None:
     page = lambda request: httpx.Response(404, html="<h1>nginx</h1>")  # noqa: E731
     with pytest.raises(UnexpectedAnswer, match=r"text/html.*nginx"):
