@@ -9,7 +9,7 @@ from collections.abc import AsyncGenerator, Iterable, Mapping, Sequence
 from contextlib import aclosing
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex
 from urllib.parse import quote
 
 from numpy.typing import ArrayLike
@@ -292,11 +292,11 @@ class AsyncClient(AsyncConnection):
             There is no such status, the limit is negative, or the page size is not from 1 to 200.
         """
         exchange, wanted = self._exchange(timeout), status_names(statuses)
-        if limit is not None and limit < 0:
-            raise BadArgument(f"limit: expected at least 0 jobs, or None for all, got {limit}.")
-        if not 1 <= page_size <= 200:
+        if limit is not None and not (isinstance(limit, SupportsIndex) and limit >= 0):
+            raise BadArgument(f"limit: expected at least 0 jobs, or None for all, got {limit!r}.")
+        if not (isinstance(page_size, SupportsIndex) and 1 <= page_size <= 200):
             raise BadArgument(
-                f"page_size: expected 1 to 200 jobs, got {page_size}. Use limit for the number of jobs in all."
+                f"page_size: expected 1 to 200 jobs, got {page_size!r}. Use limit for the number of jobs in all."
             )
         left = math.inf if limit is None else limit
         cursor: str | None = ""

@@ -7,6 +7,7 @@ import gc
 import io
 import os
 import zipfile
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -198,6 +199,15 @@ def test_arguments_of_clients_and_submissions_are_checked() -> None:
     for size in (0, 201):
         with pytest.raises(BadArgument, match=f"page_size: expected 1 to 200 jobs, got {size}. Use limit"):
             list(client.list(page_size=size))
+    wrong: Any
+    for wrong in ("3", 1.5):
+        with pytest.raises(BadArgument, match=f"limit: expected at least 0 jobs, or None for all, got {wrong!r}"):
+            list(client.list(limit=wrong))
+        with pytest.raises(BadArgument, match=f"page_size: expected 1 to 200 jobs, got {wrong!r}"):
+            list(client.list(page_size=wrong))
+    wrong = timedelta(days=1)
+    with pytest.raises(BadArgument, match="days: expected a minute"):
+        client.submit(POINTS).share(days=wrong)
     client.close()
     with pytest.raises(BadArgument, match="The client is closed"):
         client.limits()
