@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -56,16 +57,16 @@ def base_of(url: str) -> str:
     Raises
     ------
     BadArgument
-        The text is not an http or https address.
+        The text is not an http or https address, or it has a query.
     """
     try:
         parsed = httpx.URL(url)
-        valid = parsed.scheme in ("http", "https") and parsed.host != ""
-    except httpx.InvalidURL:
+        valid = parsed.scheme in ("http", "https") and parsed.host != "" and not parsed.query
+    except (httpx.InvalidURL, TypeError):
         valid = False
     if not valid:
         raise BadArgument(f"Expected the address of a service such as http://127.0.0.1:8000, got {url!r}.")
-    return url.rstrip("/")
+    return str(url).rstrip("/")
 
 
 @cache
@@ -80,7 +81,8 @@ def headers_of(token: str | None, more: Mapping[str, str] | None) -> dict[str, s
     Raises
     ------
     BadArgument
-        The token is not a text, or has characters that no token has; the message does not show it.
+        The token is not a text, or has characters that no token has; or a header is no text that HTTP allows. The message does not
+        show them.
     """
     headers = {"User-Agent": user_agent()}
     if token is not None and not isinstance(token, str):
@@ -92,7 +94,19 @@ def headers_of(token: str | None, more: Mapping[str, str] | None) -> dict[str, s
                 "token, or PLIANT_TOKEN: expected ASCII letters, digits and signs, got others. Copy the token again."
             )
         headers["Authorization"] = f"Bearer {token}"
-    return {**headers, **(more or {})}
+    if more is None:
+        return headers
+    if not isinstance(more, Mapping):
+        raise BadArgument(f"headers: expected a mapping of str to str, got a value of type {type(more).__name__}.")
+    for name, value in more.items():
+        if not isinstance(name, str) or re.fullmatch(r"[\w!#$%&'*+.^`|~-]+", name, re.ASCII) is None:
+            raise BadArgument(f"headers: expected names of ASCII letters, digits and dashes, got {name!r}.")
+        if not isinstance(value, str) or re.fullmatch(r"(?! )[ -~]*(?<! )", value) is None:
+            raise BadArgument(
+                f"headers: expected a str of printable ASCII characters, without spaces around it, for {name}, got another value. "
+                "Encode other text, for example with urllib.parse.quote."
+            )
+    return {**headers, **more}
 
 
 def request_for(

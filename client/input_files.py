@@ -45,15 +45,9 @@ def tracks_file(tracks: Source, visible: ArrayLike | None, folder: Path) -> Path
     if isinstance(tracks, Mapping):
         refuse_visible(visible)
         return _npz(folder / "tracks.npz", {str(key): _array(value, str(key)) for key, value in tracks.items()})
-    hidden: NDArray[np.bool] | None = None
-    if isinstance(tracks, np.ma.MaskedArray):
-        hidden = np.asarray(np.ma.getmaskarray(tracks).any(axis=-1))
-    points = _array(np.ma.getdata(tracks) if hidden is not None else tracks, "tracks")
-    arrays = {"tracks": points}
+    arrays = {"tracks": _array(tracks, "tracks")}
     if visible is not None:
         arrays["visibility"] = _array(visible, "visible")
-    elif hidden is not None:
-        arrays["visibility"] = ~hidden
     return _npz(folder / "tracks.npz", arrays)
 
 
@@ -103,6 +97,10 @@ def mesh_part(mesh: Source | tuple[int, int], folder: Path) -> Path | str:
         return existing_file(mesh, "mesh")
     if isinstance(mesh, Mapping):
         return _npz(folder / "mesh.npz", {str(key): _array(value, str(key)) for key, value in mesh.items()})
+    if hasattr(mesh, "faces"):
+        raise BadArgument(
+            f"mesh: expected faces (T, 3) or (T, 4), got {kind_of(mesh)}. Give its faces, such as mesh.faces, as an array, or a file."
+        )
     faces = _array(mesh, "mesh")
     if faces.shape == (2,) and faces.dtype.kind in "iu":  # a tuple, a list or an array; faces have two axes
         return f"{faces[0]}x{faces[1]}"
@@ -222,10 +220,12 @@ def existing_file(path: Path | str, name: str) -> Path:
 
 
 def _array(value: Any, name: str) -> NDArray[np.generic]:
-    """Convert anything that NumPy accepts, and PyTorch and JAX tensors on any device."""
+    """Convert anything that NumPy accepts, and PyTorch and JAX tensors on any device; masked entries become NaN."""
     for step in ("detach", "cpu"):
         if hasattr(value, "__array__") and hasattr(value, step):  # a file has `detach`, too, which makes it unusable
             value = getattr(value, step)()
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value) and value.dtype.kind in "biuf":
+        value = np.ma.filled(value.astype(np.result_type(value, np.float16)), np.nan)
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):  # rows of several lengths, or an object that NumPy cannot convert

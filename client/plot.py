@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.client.errors import PliantError
+from pliant.client.errors import BadArgument, PliantError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,9 +23,14 @@ LIGHT = np.array([-0.5, -0.6, 0.62])
 
 
 def draw(
-    shapes: NDArray[np.float64], faces: NDArray[np.int32], frames: int, *, title: str, y_axis: str = "down"
+    shapes: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    frames: int | Sequence[int],
+    *,
+    title: str,
+    y_axis: str = "down",
 ) -> Figure:
-    """Draw evenly spaced frames side by side at one scale: the lit surface, or points coloured by depth.
+    """Draw frames side by side at one scale, a number of evenly spaced ones or those listed: the lit surface, or points coloured by depth.
 
     Shapes `(F, P, 3)` have y down as in images, or up; they are drawn upright. Without faces, or with too many, only points are drawn.
 
@@ -32,12 +38,14 @@ def draw(
     ------
     PliantError
         matplotlib is not installed.
+    BadArgument
+        `frames` is neither a number of frames nor indices of frames.
     """
     try:
         from matplotlib.figure import Figure
     except ImportError as fault:
         raise PliantError("Plots need matplotlib: pip install matplotlib") from fault
-    shown = np.unique(np.linspace(0, len(shapes) - 1, max(1, frames)).round().astype(int))
+    shown = _chosen(frames, len(shapes))
     triangles = split(faces)
     reach = 0.8 * np.abs(shapes).max()
     figure = Figure(figsize=(3.2 * len(shown), 3.4), layout="constrained")
@@ -56,6 +64,18 @@ def draw(
         axes.view_init(elev=8, azim=-72)
         axes.set_axis_off()
     return figure
+
+
+def _chosen(frames: int | Sequence[int], count: int) -> list[int]:
+    """Return the indices of the frames to draw."""
+    given = np.asarray(frames)
+    if given.dtype.kind in "iu" and given.ndim == 0 and given >= 1:
+        given = np.unique(np.linspace(0, count - 1, int(given)).round().astype(int))
+    if given.dtype.kind not in "iu" or given.ndim != 1 or given.size == 0 or given.min() < 0 or given.max() >= count:
+        raise BadArgument(
+            f"frames: expected a number of frames, at least 1, or a list of frames from 0 to {count - 1}, got {frames!r}."
+        )
+    return [int(frame) for frame in given]
 
 
 def split(faces: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -8,7 +8,7 @@ import re
 import shutil
 import tempfile
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -157,18 +157,24 @@ class Reconstruction:
         """Error metrics by name; which ones depends on the inputs."""
         return self.job.metrics if self.job.metrics is not None else {}
 
-    def plot(self, frames: int = 4) -> Figure:
+    def plot(self, frames: int | Sequence[int] = 4) -> Figure:
         """Draw frames of the shape in 3-D, as a lit surface if the job has a mesh. Needs matplotlib.
 
         Parameters
         ----------
-        frames : int
-            Number of frames, evenly spaced over the sequence.
+        frames : int or sequence of int
+            Number of frames, evenly spaced over the sequence; or the frames themselves, counted from 0.
 
         Returns
         -------
         matplotlib.figure.Figure
-            One set of axes per frame; the figure is neither shown nor saved.
+            One set of axes per frame; the figure is neither shown nor saved. Notebooks show it as the value of a cell after
+            ``%matplotlib inline``.
+
+        Raises
+        ------
+        BadArgument
+            `frames` is neither.
         """
         from pliant.client.plot import draw
 

@@ -70,6 +70,11 @@ class Retry:
     jitter: Callable[[], float] = random.random
     """Returns a factor in [0, 1) for each pause, which spreads the retries of many clients."""
 
+    def __post_init__(self) -> None:
+        for name in ("patience", "first_contact", "shortest_pause", "longest_pause", "long_poll", "poll_interval"):
+            if _seconds(getattr(self, name), name) < 0:
+                raise BadArgument(f"{name}: expected at least 0 seconds, got {getattr(self, name)!r}.")
+
 
 @dataclass(kw_only=True)
 class Contact:
@@ -101,7 +106,7 @@ class Attempts:
 
     def __post_init__(self) -> None:
         if self.timeout is not None:
-            self.timeout = _seconds(self.timeout)
+            self.timeout = _seconds(self.timeout, "timeout")
         self.deadline = math.inf if self.timeout is None else self.retries.clock() + self.timeout
 
     def remaining(self) -> float:
@@ -179,7 +184,7 @@ class Attempts:
         if now + pause >= self.deadline:
             raise WaitTimeout(
                 f"The timeout of {self.timeout:g} s passed during {self.doing}; the last error was: "
-                f"{str(fault).removesuffix('.') or type(fault).__name__}. {self._advice}"
+                f"{_words(fault)}. {self._advice}"
             ) from fault
         return pause
 
@@ -187,20 +192,33 @@ class Attempts:
         """Return the error that the caller sees after the last attempt."""
         if isinstance(fault, PliantError):
             return fault
-        return Unreachable(
-            f"No answer from the service at {self.contact.url}: {str(fault) or type(fault).__name__}. "
-            "Check the address, and that `pliant up` is running there."
-        )
+        advice = "Check the address, and that `pliant up` is running there."
+        if _proxied(self.contact.url):
+            advice += " Requests go to the proxy in HTTP_PROXY, HTTPS_PROXY or ALL_PROXY, unless NO_PROXY lists the service's host."
+        return Unreachable(f"No answer from the service at {self.contact.url}: {_words(fault)}. {advice}")
 
 
-def _seconds(timeout: object) -> float:
-    """Return a timeout, which may be a number of NumPy, as a float."""
+def _words(fault: Exception) -> str:
+    """Return the message of an error without the period at its end; some errors of connections have none, only a type."""
+    return str(fault).rstrip(".") or type(fault).__name__
+
+
+def _proxied(url: str) -> bool:
+    """Return True if the environment names a proxy for an address, as httpx reads it."""
+    from urllib.request import getproxies, proxy_bypass  # here, because it is not needed otherwise
+
+    address = httpx.URL(url)
+    return not getproxies().keys().isdisjoint((address.scheme, "all")) and not proxy_bypass(address.host)
+
+
+def _seconds(given: object, name: str) -> float:
+    """Return a time, which may be a number of NumPy, as a float."""
     try:
-        seconds = float(timeout) if isinstance(timeout, SupportsFloat) and not isinstance(timeout, bool) else math.nan
+        seconds = float(given) if isinstance(given, SupportsFloat) and not isinstance(given, bool) else math.nan
     except (TypeError, ValueError):  # an array
         seconds = math.nan
     if math.isnan(seconds):
-        raise BadArgument(f"timeout: expected seconds as a number, or None, got {timeout!r}.")
+        raise BadArgument(f"{name}: expected seconds as a number, got {given!r}.")
     return seconds
 
 

@@ -13,6 +13,8 @@ from pliant.solver.records import MIN_FRAMES, MIN_POINTS, Floats, KnownCamera, T
 from pliant.solver.settings import Settings
 
 MAKE_TRACKS = "Use Tracks.from_arrays(points, visible), which validates and converts."
+MAKE_MESH = "Use Mesh.from_faces(faces, num_points)."
+MAKE_SETTINGS = "Use Settings(…)."
 MAKE_CAMERAS = "Use KnownCamera.from_arrays(rotations, scales), which validates and converts."
 
 MAX_CENTRE_RADII = 100.0
@@ -37,9 +39,9 @@ def check_agreement(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | No
     """
     check_tracks(tracks)
     for field, value, kind, make in (
-        ("mesh", mesh, Mesh, "Use Mesh.from_faces(faces, num_points)."),
+        ("mesh", mesh, Mesh, MAKE_MESH),
         ("cameras", cameras, KnownCamera, MAKE_CAMERAS),
-        ("settings", settings, Settings, "Use Settings(…)."),
+        ("settings", settings, Settings, MAKE_SETTINGS),
     ):
         if value is not None:
             check_type(field, value, kind, make)

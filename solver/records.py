@@ -54,7 +54,7 @@ class Tracks:
         points : array_like, shape (F, P, 2)
             NaN, infinity or the mask of a masked array in either coordinate marks the observation as hidden.
         visible : array_like, shape (F, P), optional
-            Bool or confidence in [0, 1].
+            Bool or confidence in [0, 1]; masked entries are hidden.
         scratch : path, optional
             Folder for temporary files that hold the copies; None holds them in memory. With it and memory-mapped input
             (`numpy.load(path, mmap_mode="r")`), tracks may be larger than the memory.
@@ -208,7 +208,8 @@ class KnownCamera:
 
     scales: Floats | None = None
     """Shape `(F,)`, the tracks' unit per unit of the shapes; None estimates them if the camera model has scales. For a perspective
-    camera, φ divided by the depth of the shape's origin."""
+    camera, φ divided by the depth of the shape's origin, which is the mean of its points, not the origin of your world: with another
+    depth the shapes have another size."""
 
     focal: float | None = None
     """φ, the tracks' unit; None takes it from the settings."""
@@ -377,7 +378,8 @@ def _confidence(visible: ArrayLike | None, shape: tuple[int, int], scratch: str 
     if visible is None:
         confidence[...] = 1.0
         return confidence
-    given = numeric(visible, "visibility", "Convert the array to bool.", kinds="bfiu")
+    shown = visible.filled(0) if isinstance(visible, np.ma.MaskedArray) else visible
+    given = numeric(shown, "visibility", "Convert the array to bool.", kinds="bfiu")
     if given.shape != shape:
         raise wrong_input(
             "visibility",
@@ -387,9 +389,12 @@ def _confidence(visible: ArrayLike | None, shape: tuple[int, int], scratch: str 
             "Visibility is (frames, points), like the tracks.",
         )
     confidence[...] = given
-    if not np.isfinite(confidence).all() or confidence.min() < 0 or confidence.max() > 1:
+    finite = bool(np.isfinite(confidence).all())
+    if not finite or confidence.min() < 0 or confidence.max() > 1:
+        got = (
+            f"values from {confidence.min():.3g} to {confidence.max():.3g}" if finite else "values that are not finite"
+        )
         raise wrong_input(
-            "visibility", "out_of_range", "values from 0 to 1", f"values from {confidence.min():.3g} to {confidence.max():.3g}",
-            "Convert a mask to bool, and logits to probabilities.",
+            "visibility", "out_of_range", "values from 0 to 1", got, "Convert a mask to bool, logits to probabilities, and NaN to 0."
         )  # fmt: skip
     return confidence

@@ -41,7 +41,7 @@ _SENTENCES = {
     ),
     Outcome.REJECTED: (
         "The last step increased the objective by more than the tolerance and was rejected; the shapes are those before it. "
-        "Try precision float64 or weaker weights if they are not good enough."
+        "If they are not good enough, try precision float64, weaker weights, or a tolerance above the rounding errors, such as the default."
     ),
     Outcome.STOPPED: "Stopped on request; the shapes are those of the last finished step.",
 }

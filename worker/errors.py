@@ -268,8 +268,7 @@ class TimedOut(WorkerError):
 
     def __init__(self, limit: float) -> None:
         super().__init__(
-            f"The job exceeded its option time_limit of {limit:g} s. Raise it, send fewer points or frames, "
-            "or lower max_reweightings."
+            f"The job exceeded its option time_limit of {limit:g} s. Raise it, or send fewer points or frames."
         )
 
 

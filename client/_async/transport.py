@@ -94,7 +94,7 @@ class Exchange:
         while True:
             try:
                 async with self.stream(call) as response:
-                    body = await response.aread()
+                    body = await read(response, self.attempts)
             except httpx.TransportError as lost:
                 await self.pause_or_raise(call, lost)
                 continue
@@ -126,16 +126,26 @@ class Exchange:
                 response = await self.send(call)
                 if response.is_success or (response.status_code == 307 and "redirect" in call.params):
                     return response
-                fault = await refusal(response)
+                fault = await refusal(response, self.attempts)
             except httpx.TransportError as lost:
                 fault = lost
             await self.pause_or_raise(call, fault)
 
 
-async def refusal(response: httpx.Response) -> PliantError:
+async def read(response: httpx.Response, attempts: Attempts) -> bytes:
+    """Read a body, and give up at the deadline if it arrives in pieces: the timeout of the network bounds only the time without a byte."""
+    pieces: list[bytes] = []
+    async for piece in response.aiter_bytes():
+        if pieces:
+            attempts.remaining()
+        pieces.append(piece)
+    return b"".join(pieces)
+
+
+async def refusal(response: httpx.Response, attempts: Attempts) -> PliantError:
     """Read a response with status 300 or above completely and return the corresponding error."""
     try:
-        body = await response.aread()
+        body = await read(response, attempts)
     finally:
         await response.aclose()
     return error_from(response.status_code, response.headers, body)

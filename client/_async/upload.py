@@ -12,7 +12,7 @@ from pathlib import Path
 
 import httpx
 from pliant.client import multipart
-from pliant.client._async.transport import Exchange, parse, refusal
+from pliant.client._async.transport import Exchange, parse, read, refusal
 from pliant.client.call import Call
 from pliant.client.errors import APIStatusError, NotFound, PliantError, TooManyRequests
 from pliant.client.multipart import Form, Remainder, sha256
@@ -70,11 +70,11 @@ async def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str,
         try:
             response = await exchange.send(call)
             if response.is_success:
-                await response.aread()
+                await read(response, attempts)
                 await response.aclose()
                 attempts.succeeded()
                 return
-            fault = await refusal(response)
+            fault = await refusal(response, attempts)
         except httpx.TransportError as lost:
             fault = lost
         if isinstance(fault, APIStatusError) and (fault.code in OUT_OF_STEP or fault.problem.retryable):
@@ -100,7 +100,7 @@ async def _state(exchange: Exchange, upload_id: str) -> Upload:
     while True:
         try:
             async with exchange.stream(call) as response:
-                return parse(Upload, await response.aread(), response.status_code)
+                return parse(Upload, await read(response, exchange.attempts), response.status_code)
         except NotFound as missing:
             if missing.code != "unknown_upload":
                 raise

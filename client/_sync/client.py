@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import secrets
 import tempfile
@@ -11,7 +10,7 @@ from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex
 from urllib.parse import quote
 
 from numpy.typing import ArrayLike
@@ -32,9 +31,14 @@ from pliant.client.retry import SUBMISSION
 from pliant.schemas.job import Inspection, Job, JobPage, Priority, ServiceLimits, Status
 from pliant.schemas.options import Options, Output
 from pliant.schemas.shares import Share
+from pydantic import RootModel
 
 JSON = "application/json"
 JSON_BODY = {"Content-Type": JSON}
+
+
+class Document(RootModel[Any]):
+    """JSON of any form."""
 
 
 class Client(Connection):
@@ -289,11 +293,11 @@ class Client(Connection):
             There is no such status, the limit is negative, or the page size is not from 1 to 200.
         """
         exchange, wanted = self._exchange(timeout), status_names(statuses)
-        if limit is not None and limit < 0:
-            raise BadArgument(f"limit: expected at least 0 jobs, or None for all, got {limit}.")
-        if not 1 <= page_size <= 200:
+        if limit is not None and not (isinstance(limit, SupportsIndex) and limit >= 0):
+            raise BadArgument(f"limit: expected at least 0 jobs, or None for all, got {limit!r}.")
+        if not (isinstance(page_size, SupportsIndex) and 1 <= page_size <= 200):
             raise BadArgument(
-                f"page_size: expected 1 to 200 jobs, got {page_size}. Use limit for the number of jobs in all."
+                f"page_size: expected 1 to 200 jobs, got {page_size!r}. Use limit for the number of jobs in all."
             )
         left = math.inf if limit is None else limit
         cursor: str | None = ""
@@ -510,5 +514,5 @@ class Client(Connection):
                 raise
 
     def _document(self, path: str, timeout: float | None) -> Any:
-        _, body = self._exchange(timeout).answer(Call(method="GET", path=path, headers={"Accept": JSON}))
-        return json.loads(body)
+        call = Call(method="GET", path=path, headers={"Accept": JSON})
+        return (self._exchange(timeout).record(call, Document)).root

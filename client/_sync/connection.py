@@ -26,7 +26,7 @@ class Connection:
     """Base class of `Client`, which documents the parameters. Close it, or use it in a ``with`` block."""
 
     url: str
-    """Address of the service, without a slash at the end."""
+    """Address of the service, without user name and password, and without a slash at the end."""
 
     def __init__(
         self,
@@ -41,16 +41,28 @@ class Connection:
     ) -> None:
         if not isinstance(retries, Retry):
             raise BadArgument(f"retries: expected a Retry, such as Retry(patience=10), got {retries!r}.")
-        self.url = base_of(url if url is not None else os.environ.get("PLIANT_URL") or DEFAULT_URL)
+        address = base_of(url if url is not None else os.environ.get("PLIANT_URL") or DEFAULT_URL)
+        self.url = str(httpx.URL(address).copy_with(userinfo=b""))
         bearer = token if token is not None else os.environ.get("PLIANT_TOKEN") or None
-        self._http = httpx.Client(
-            base_url=self.url,
-            headers=headers_of(bearer, headers),
-            verify=verify,
-            limits=UNLIMITED,
-            event_hooks=event_hooks,
-            transport=transport,
-        )
+        every = headers_of(bearer, headers)
+        try:
+            self._http = httpx.Client(
+                base_url=address,
+                headers=every,
+                verify=verify,
+                limits=UNLIMITED,
+                event_hooks=event_hooks,
+                transport=transport,
+            )
+        except (
+            ImportError,
+            OSError,
+            ValueError,
+        ) as fault:  # a SOCKS proxy, a file of certificates, the address of a proxy
+            raise BadArgument(
+                f"The connections cannot be set up: {str(fault).rstrip('.')}. Check verify and the environment variables HTTP_PROXY, "
+                "HTTPS_PROXY, ALL_PROXY, NO_PROXY, SSL_CERT_FILE and SSL_CERT_DIR."
+            ) from fault
         self._retries = retries
         self._contact = Contact(url=self.url)
 

@@ -95,7 +95,7 @@ class Exchange:
         while True:
             try:
                 with self.stream(call) as response:
-                    body = response.read()
+                    body = read(response, self.attempts)
             except httpx.TransportError as lost:
                 self.pause_or_raise(call, lost)
                 continue
@@ -127,16 +127,26 @@ class Exchange:
                 response = self.send(call)
                 if response.is_success or (response.status_code == 307 and "redirect" in call.params):
                     return response
-                fault = refusal(response)
+                fault = refusal(response, self.attempts)
             except httpx.TransportError as lost:
                 fault = lost
             self.pause_or_raise(call, fault)
 
 
-def refusal(response: httpx.Response) -> PliantError:
+def read(response: httpx.Response, attempts: Attempts) -> bytes:
+    """Read a body, and give up at the deadline if it arrives in pieces: the timeout of the network bounds only the time without a byte."""
+    pieces: list[bytes] = []
+    for piece in response.iter_bytes():
+        if pieces:
+            attempts.remaining()
+        pieces.append(piece)
+    return b"".join(pieces)
+
+
+def refusal(response: httpx.Response, attempts: Attempts) -> PliantError:
     """Read a response with status 300 or above completely and return the corresponding error."""
     try:
-        body = response.read()
+        body = read(response, attempts)
     finally:
         response.close()
     return error_from(response.status_code, response.headers, body)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import httpx
 from pliant.client import multipart
-from pliant.client._sync.transport import Exchange, parse, refusal
+from pliant.client._sync.transport import Exchange, parse, read, refusal
 from pliant.client.call import Call
 from pliant.client.errors import APIStatusError, NotFound, PliantError, TooManyRequests
 from pliant.client.multipart import Form, Remainder, sha256
@@ -71,11 +71,11 @@ def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str, repor
         try:
             response = exchange.send(call)
             if response.is_success:
-                response.read()
+                read(response, attempts)
                 response.close()
                 attempts.succeeded()
                 return
-            fault = refusal(response)
+            fault = refusal(response, attempts)
         except httpx.TransportError as lost:
             fault = lost
         if isinstance(fault, APIStatusError) and (fault.code in OUT_OF_STEP or fault.problem.retryable):
@@ -101,7 +101,7 @@ def _state(exchange: Exchange, upload_id: str) -> Upload:
     while True:
         try:
             with exchange.stream(call) as response:
-                return parse(Upload, response.read(), response.status_code)
+                return parse(Upload, read(response, exchange.attempts), response.status_code)
         except NotFound as missing:
             if missing.code != "unknown_upload":
                 raise

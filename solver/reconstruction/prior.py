@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pliant.solver.agreement import check_tracks
+from pliant.solver.agreement import check_tracks, check_type
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.energy.hyperparameters import noise_std
@@ -20,6 +20,8 @@ from pliant.solver.refinement.covariance_learning import learn_covariance
 from pliant.solver.refinement.depth_rounds import with_depth_map
 from pliant.solver.shapes.jackknife import Changes, learning_changes
 from pliant.solver.threads import serial_blas
+
+MAKE_ESTIMATE = "Use estimate_cameras(tracks), or estimate_cameras(tracks, known) for given cameras."
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -109,9 +111,10 @@ def learn_prior(
     Raises
     ------
     InvalidInput
-        The cameras were estimated from other tracks, or these are no valid `Tracks`.
+        The cameras were estimated from other tracks or are no `Cameras`, or the tracks are no valid `Tracks`.
     """
     check_tracks(tracks)
+    check_type("cameras", cameras, Cameras, MAKE_ESTIMATE)
     given = cameras.observations.tracks
     if given is not tracks and not (
         np.array_equal(given.points, tracks.points) and np.array_equal(given.visible, tracks.visible)

@@ -16,7 +16,7 @@ from pliant.solver.reconstruction.observations import OnStep, monitored
 from pliant.solver.reconstruction.prior import Prior, changes_of
 from pliant.solver.reconstruction.shapes import shapes_from
 from pliant.solver.reconstruction.solution import in_world_unit
-from pliant.solver.reconstruction.start import begin, check_shapes, without_learned_prior
+from pliant.solver.reconstruction.start import begin, check_shapes, check_types, without_learned_prior
 from pliant.solver.records import Floats, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.solution import Solution
@@ -63,7 +63,7 @@ def solve_shapes(
     Raises
     ------
     InvalidInput
-        Mesh, cameras, prior or start do not match the tracks, or these are no valid `Tracks`.
+        Mesh, cameras, prior or start do not match the tracks, these are no valid `Tracks`, or an argument has another type.
     InvalidSettings
         The settings select another prior than the given one, or require a mesh that is a grid.
     NotFinite
@@ -72,6 +72,7 @@ def solve_shapes(
         The folder `scratch` is missing, cannot be written to, or has too little space.
     """
     check_tracks(tracks)
+    check_types(cameras, prior, mesh, settings)
     observations = cameras.observations.of(tracks)
     first = None if start is None else np.asarray(start.shapes if isinstance(start, Solution) else start, dtype=float)
     if first is not None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.agreement import check_mesh, check_tracks
+from pliant.solver.agreement import MAKE_MESH, MAKE_SETTINGS, check_mesh, check_tracks, check_type
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import orthographic
 from pliant.solver.energy.problem import Problem
@@ -17,7 +17,7 @@ from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import ShouldStop, pulses_to
 from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import Observations, OnStep, monitored
-from pliant.solver.reconstruction.prior import Prior, estimate_with
+from pliant.solver.reconstruction.prior import MAKE_ESTIMATE, Prior, estimate_with
 from pliant.solver.records import Choices, Floats, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
@@ -111,11 +111,12 @@ def find_outliers(
     Raises
     ------
     InvalidInput
-        Mesh, cameras or prior do not match the tracks, or these are no valid `Tracks`.
+        Mesh, cameras or prior do not match the tracks, these are no valid `Tracks`, or an argument has another type.
     InvalidSettings
         The settings select another prior than the given one.
     """
     check_tracks(tracks)
+    check_types(cameras, prior, mesh, settings)
     used = cameras.observations.settings if settings is None else settings
     monitor = monitored(tracks, None, used, on_step, should_stop, only=("shapes",))
     with serial_blas(), pulses_to(monitor.pulse):
@@ -229,6 +230,24 @@ def warm(start: Start, shapes: Floats) -> Start:
     coordinates = (part / start.flat.unit) @ np.linalg.inv(problem.axes).T
     there = np.ascontiguousarray(coordinates.transpose(0, 2, 1), dtype=problem.points.dtype)
     return replace(start, state=init(problem, there, start.state.translations))
+
+
+def check_types(cameras: Cameras, prior: Prior | None, mesh: Mesh | None, settings: Settings | None) -> None:
+    """Check that the arguments of a stage are records of the expected classes, e.g. no mesh in place of the prior.
+
+    Raises
+    ------
+    InvalidInput
+        Code `wrong_type`.
+    """
+    check_type("cameras", cameras, Cameras, MAKE_ESTIMATE)
+    for field, value, kind, make in (
+        ("prior", prior, Prior, "Use learn_prior(tracks, cameras), or None for a prior that is not learned."),
+        ("mesh", mesh, Mesh, MAKE_MESH),
+        ("settings", settings, Settings, MAKE_SETTINGS),
+    ):
+        if value is not None:
+            check_type(field, value, kind, make)
 
 
 def check_shapes(shapes: Floats, tracks: Tracks) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from pliant.client import AsyncClient, BadArgument, Client, NotLoaded, Result
+from pliant.client import AsyncClient, BadArgument, Client, NotLoaded, Result, Retry, Unreachable
 from pliant.service.testing import InMemoryService
 
 
@@ -59,6 +59,21 @@ def test_an_empty_variable_counts_as_unset(monkeypatch: pytest.MonkeyPatch) -> N
         Client("")
 
 
+@pytest.mark.parametrize("url", ["http://pliant.example?x=1", "pliant.example", "ftp://pliant.example", 5])
+def test_what_is_no_address_is_refused(url: Any) -> None:
+    with pytest.raises(BadArgument, match="Expected the address of a service"):
+        Client(url)
+
+
+def test_a_password_in_the_address_is_sent_and_not_shown() -> None:
+    client = Client(httpx.URL("http://me:secret@pliant.example/base/"), transport=ECHO)  # type: ignore[arg-type]
+    assert sent(client).headers["authorization"].startswith("Basic ")
+    assert (client.url, repr(client)) == ("http://pliant.example/base", "<Client http://pliant.example/base>")
+    with pytest.raises(Unreachable) as caught:
+        Client("http://me:secret@127.0.0.1:1", retries=Retry(first_contact=0)).limits()
+    assert "secret" not in str(caught.value)
+
+
 def test_headers_and_event_hooks_apply_to_every_request() -> None:
     hooked: list[str] = []
     client = Client(
@@ -70,6 +85,25 @@ def test_headers_and_event_hooks_apply_to_every_request() -> None:
     assert request.headers["x-team"] == "capture"
     assert request.headers["user-agent"].startswith("pliant-client/")
     assert hooked == ["/v1/options"]
+
+
+@pytest.mark.parametrize(
+    ("headers", "words"),
+    [
+        ({"X-Team": "Bühne"}, "printable ASCII .* for X-Team, got another value. Encode"),
+        ({"X-Team": "a\nb"}, "printable ASCII .* for X-Team"),
+        ({"X-Team": " a"}, "without spaces around it, for X-Team"),
+        ({"X-Team": 5}, "expected a str .* for X-Team"),
+        ({"Bühne": "a"}, "expected names of ASCII .* got 'Bühne'"),
+        ({"X Team": "a"}, "expected names of ASCII .* got 'X Team'"),
+        ({5: "a"}, "expected names of ASCII .* got 5"),
+        ([("X-Team", "a")], "expected a mapping of str to str, got a value of type list"),
+    ],
+)
+def test_headers_that_http_does_not_allow_are_refused_in_words(headers: Any, words: str) -> None:
+    with pytest.raises(BadArgument, match=f"headers: .*{words}"):
+        Client(headers=headers, transport=ECHO)
+    assert sent(Client(headers={"X-Team": "", "x_1.~": "a b;c"}, transport=ECHO)).headers["x_1.~"] == "a b;c"
 
 
 def test_the_asynchronous_client_takes_asynchronous_hooks() -> None:
@@ -84,6 +118,34 @@ def test_the_asynchronous_client_takes_asynchronous_hooks() -> None:
 
     asyncio.run(use())
     assert hooked == ["/v1/options"]
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "words"),
+    [
+        ("HTTP_PROXY", "ftp://proxy.example", "Unknown scheme for proxy URL"),
+        ("ALL_PROXY", "socks5://proxy.example:1080", "SOCKS proxy"),
+        ("SSL_CERT_FILE", "/missing/certificates.pem", "No such file"),
+    ],
+)
+@pytest.mark.parametrize("kind", [Client, AsyncClient])
+def test_variables_that_httpx_cannot_use_are_named(
+    monkeypatch: pytest.MonkeyPatch, kind: type[Client], variable: str, value: str, words: str
+) -> None:
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(BadArgument, match=f"connections cannot be set up: .*{words}.* {variable}"):
+        kind("http://pliant.example")
+
+
+def test_the_error_about_an_unreachable_service_names_a_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("http_proxy", "all_proxy", "ALL_PROXY", "no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HTTP_PROXY", "http://127.0.0.1:1")
+    for excepted, named in (("", True), ("127.0.0.1", False)):
+        monkeypatch.setenv("NO_PROXY", excepted)
+        with pytest.raises(Unreachable, match="`pliant up` is running there") as caught:
+            Client("http://127.0.0.1:1", retries=Retry(first_contact=0)).limits()
+        assert ("NO_PROXY" in str(caught.value)) is named
 
 
 def test_verify_reaches_httpx(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import io
+from typing import Any
 
 import numpy as np
 import pytest
-from pliant.client import plot
+from pliant.client import BadArgument, plot
 from pliant.solver.gallery import flag
 
 art3d = pytest.importorskip("mpl_toolkits.mplot3d.art3d")
@@ -31,6 +32,20 @@ def test_a_mesh_is_drawn_as_a_lit_surface() -> None:
     written = io.BytesIO()
     figure.savefig(written, dpi=40)
     assert written.getvalue().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("frames", [[5, 1], (5, 1), np.array([5, 1]), range(5, 0, -4)])
+def test_frames_may_be_listed(frames: Any) -> None:
+    figure = plot.draw(SHAPES, np.zeros((0, 3), np.int32), frames, title="flag")
+    assert [axes.get_title() for axes in figure.axes] == ["frame 5", "frame 1"]
+
+
+@pytest.mark.parametrize("frames", [0, -1, 2.5, None, "all", [], [6], [-1], [0.5], [[0, 1]]])
+def test_frames_that_are_neither_a_number_nor_a_list_are_refused(frames: Any) -> None:
+    with pytest.raises(
+        BadArgument, match="frames: expected a number of frames, at least 1, or a list of frames from 0 to 5, got"
+    ):
+        plot.draw(SHAPES, np.zeros((0, 3), np.int32), frames, title="flag")
 
 
 @pytest.mark.parametrize("most", [0, None])

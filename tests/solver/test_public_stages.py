@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -305,3 +306,20 @@ def test_every_stage_refuses_tracks_made_without_validation(wrong: Tracks, camer
         with pytest.raises(InvalidInput, match=r"Tracks\.from_arrays") as caught:
             stage(wrong, *more)  # type: ignore[operator]
         assert (caught.value.code, caught.value.field) == ("wrong_type", "tracks")
+
+
+def test_stages_refuse_arguments_of_other_types(cameras: Cameras, prior: Prior) -> None:
+    tracks, mesh = MADE.tracks, MADE.mesh
+    calls: list[tuple[str, Any]] = [
+        ("cameras", lambda: learn_prior(tracks, KNOWN)),  # type: ignore[arg-type]
+        ("cameras", lambda: find_outliers(tracks, KNOWN, prior)),  # type: ignore[arg-type]
+        ("cameras", lambda: solve_shapes(tracks, KNOWN, prior, mesh)),  # type: ignore[arg-type]
+        ("prior", lambda: find_outliers(tracks, cameras, mesh)),  # type: ignore[arg-type]
+        ("prior", lambda: solve_shapes(tracks, cameras, mesh)),  # type: ignore[arg-type]
+        ("mesh", lambda: solve_shapes(tracks, cameras, prior, mesh.faces)),  # type: ignore[arg-type]
+        ("settings", lambda: solve_shapes(tracks, cameras, prior, mesh, settings={})),  # type: ignore[arg-type]
+    ]
+    for field, call in calls:
+        with pytest.raises(InvalidInput, match=f"{field}: expected a .*, got a value of type") as caught:
+            call()
+        assert caught.value.code == "wrong_type"

@@ -40,6 +40,8 @@ class TestTracks:
         masked[1, 2, 0] = np.ma.masked
         masked.data[1, 2] = 1e5
         tracks = Tracks.from_arrays(masked)
+        of_confidence = Tracks.from_arrays(POINTS, np.ma.array(np.ones(POINTS.shape[:2]), mask=masked.mask[..., 0]))
+        np.testing.assert_array_equal(of_confidence.visible, tracks.visible)
         assert tracks.visible[1, 2] == 0
         assert tracks.visible.sum() == tracks.visible.size - 1
 
@@ -272,3 +274,4 @@ def test_an_array_that_is_no_pair_is_refused_in_words(wrong: Any) -> None:
 
 def test_every_outcome_has_a_sentence() -> None:
     assert all(outcome.sentence.endswith(".") for outcome in Outcome)
+    assert "a tolerance above the rounding errors" in Outcome.REJECTED.sentence

@@ -143,7 +143,7 @@ def write_glb(
         "accessors": buffer.accessors,
     }
     if view is not None:
-        _add_camera(document, buffer, view)
+        _add_camera(document, buffer, view, name="camera" if name != "camera" else "film camera")
     if texture is not None:
         _add_picture(document, buffer, texture)
     document["buffers"] = [{"byteLength": buffer.bytes}]
@@ -190,11 +190,11 @@ def _add_picture(document: dict[str, Any], buffer: Buffer, texture: Texture) -> 
     document["textures"] = [{"source": 0, "sampler": 0}]
 
 
-def _add_camera(document: dict[str, Any], buffer: Buffer, view: View) -> None:
+def _add_camera(document: dict[str, Any], buffer: Buffer, view: View, *, name: str) -> None:
     """Add camera, node and the two channels of its motion, with the times of the weights."""
     document["cameras"] = [view.lens]
     document["nodes"].append(
-        {"name": "camera", "camera": 0, "rotation": view.rotations[0].tolist(), "translation": view.translations[0].tolist()}
+        {"name": name, "camera": 0, "rotation": view.rotations[0].tolist(), "translation": view.translations[0].tolist()}
     )  # fmt: skip
     document["scenes"][0]["nodes"].append(1)
     motion = document["animations"][0]

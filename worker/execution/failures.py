@@ -56,7 +56,7 @@ def timed_out(limit: float) -> Problem:
     """Return the problem of a job that exceeded its time limit."""
     return Problem.of(
         "timed_out",
-        detail=f"The job exceeded the time limit of {limit:g} s. Send fewer points or frames, lower max_reweightings, "
+        detail=f"The job exceeded the time limit of {limit:g} s. Send fewer points or frames, "
         "or ask the operator to raise PLIANT_TIME_LIMIT.",
     )
 

@@ -7,6 +7,7 @@ import gc
 import io
 import os
 import zipfile
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +57,20 @@ def test_an_array_keeps_its_dtype_and_stores_its_visibility(tmp_path: Path) -> N
 def test_masked_array_entries_become_hidden_points(tmp_path: Path) -> None:
     mask = np.zeros(POINTS.shape, bool)
     mask[1, 2, 0] = True
-    held = arrays(tracks_file(np.ma.masked_array(POINTS, mask), None, tmp_path))
-    assert np.argwhere(~held["visibility"]).tolist() == [[1, 2]]
+    masked = np.ma.masked_array(POINTS, mask)
+    confidence = np.ma.masked_array(np.ones((4, 9), bool), mask[..., 0])
+    for given, visible in ((masked, None), (masked, np.ones((4, 9))), ({"tracks": masked}, None)):
+        held = arrays(tracks_file(given, visible, tmp_path))
+        assert np.argwhere(np.isnan(held["tracks"]).any(axis=2)).tolist() == [[1, 2]]
+        assert held["tracks"].dtype == np.float32
+    held = arrays(tracks_file(POINTS, confidence, tmp_path))
+    assert np.argwhere(np.isnan(held["visibility"])).tolist() == [[1, 2]]
+    reading = Client("http://pliant.test", transport=InMemoryService()).inspect(POINTS, visible=confidence)
+    assert reading.hidden_fraction == 1 / 36
+    assert (
+        arrays(tracks_file(np.ma.masked_array(np.arange(72).reshape(4, 9, 2)), None, tmp_path))["tracks"].dtype.kind
+        == "i"
+    )
 
 
 def test_the_dictionary_of_a_tracker_is_sent_unchanged(tmp_path: Path) -> None:
@@ -186,6 +199,15 @@ def test_arguments_of_clients_and_submissions_are_checked() -> None:
     for size in (0, 201):
         with pytest.raises(BadArgument, match=f"page_size: expected 1 to 200 jobs, got {size}. Use limit"):
             list(client.list(page_size=size))
+    wrong: Any
+    for wrong in ("3", 1.5):
+        with pytest.raises(BadArgument, match=f"limit: expected at least 0 jobs, or None for all, got {wrong!r}"):
+            list(client.list(limit=wrong))
+        with pytest.raises(BadArgument, match=f"page_size: expected 1 to 200 jobs, got {wrong!r}"):
+            list(client.list(page_size=wrong))
+    wrong = timedelta(days=1)
+    with pytest.raises(BadArgument, match="days: expected a minute"):
+        client.submit(POINTS).share(days=wrong)
     client.close()
     with pytest.raises(BadArgument, match="The client is closed"):
         client.limits()

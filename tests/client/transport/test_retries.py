@@ -402,12 +402,39 @@ def test_the_timeout_of_a_submission_also_ends_a_slow_upload(
     assert len(sent) == 3
 
 
+@pytest.mark.parametrize("status", [200, 400])
+def test_the_timeout_bounds_a_body_that_arrives_slowly(clock: Clock, status: int) -> None:
+    class Slow(httpx.SyncByteStream):
+        def __iter__(self) -> Iterator[bytes]:
+            for _ in range(100):
+                clock.now += 1
+                yield b" "
+
+    client = client_of(Flaky(lambda request: httpx.Response(status, stream=Slow())), clock)
+    with pytest.raises(WaitTimeout, match="The timeout of 3 s passed"):
+        client.limits(timeout=3)
+    assert clock.now == 3
+
+
+@pytest.mark.parametrize(("message", "words"), [("", "ReadError"), ("Server disconnected.", "Server disconnected")])
+def test_the_last_error_is_named_whether_or_not_it_has_a_message(clock: Clock, message: str, words: str) -> None:
+    def lost(request: httpx.Request) -> httpx.Response:
+        raise httpx.ReadError(message)
+
+    with pytest.raises(WaitTimeout, match=rf"the last error was: {words}\. Nothing"):
+        client_of(Flaky(*[lost] * 30), clock).limits(timeout=3)
+    with pytest.raises(Unreachable, match=rf"pliant\.test: {words}\. Check"):
+        client_of(Flaky(*[lost] * 30), clock).limits()
+
+
 def test_a_response_of_another_server_is_an_error(clock: Clock) -> None:
     page = lambda request: httpx.Response(404, html="<h1>nginx</h1>")  # noqa: E731
     with pytest.raises(UnexpectedAnswer, match=r"text/html.*nginx"):
         client_of(Flaky(page), clock).options()
     with pytest.raises(UnexpectedAnswer, match="Expected a Job with status 200"):
         client_of(Flaky(lambda request: httpx.Response(200, json={"hello": 1})), clock).get("a")
+    with pytest.raises(UnexpectedAnswer, match="Expected a Document with status 200, got '<h1>Welcome"):
+        client_of(Flaky(lambda request: httpx.Response(200, html="<h1>Welcome</h1>")), clock).ready()
     nonsense = {"content-type": "application/problem+json"}
     with pytest.raises(UnexpectedAnswer, match="cannot be read"):
         client_of(Flaky(lambda request: httpx.Response(500, content=b"{", headers=nonsense)), clock).get("a")
@@ -485,3 +512,16 @@ def test_an_input_error_has_all_its_fields(clock: Clock) -> None:
     assert problem.field == "tracks"
     assert "(frames, points, 2)" in str(problem.expected)
     assert "(5, 9)" in str(problem.got)
+
+
+@pytest.mark.parametrize(
+    "name", ["patience", "first_contact", "shortest_pause", "longest_pause", "long_poll", "poll_interval"]
+)
+def test_a_time_that_is_negative_or_no_number_is_refused(name: str) -> None:
+    with pytest.raises(BadArgument, match=f"{name}: expected at least 0 seconds, got -1"):
+        Retry(**{name: -1})
+    wrong: Any
+    for wrong in (math.nan, None, "5 s"):
+        with pytest.raises(BadArgument, match=f"{name}: expected seconds as a number, got"):
+            Retry(**{name: wrong})
+    assert Retry(**{name: np.float32(0.5)}) == Retry(**{name: 0.5})

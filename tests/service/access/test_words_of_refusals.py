@@ -217,7 +217,7 @@ ERRORS: dict[str, tuple[Exception, str]] = {
     "a large upload": (errors.UploadTooLarge(1000, 2000), "body: expected at most 1,000 bytes, got 2,000 or more. Send fewer frames or points, or store float32; see /v1/limits."),
     "a store that is away": (errors.StoreUnavailable("Redis", reason="connection refused"), "Redis is unavailable (connection refused). No data was lost; try again in a few seconds."),
     "a directory in use": (errors.DataDirectoryInUse("/srv/pliant", holder="process 7"), "/srv/pliant is already used by process 7. Stop it first, or choose another directory (--data)."),
-    "a job out of time": (errors.TimedOut(60.0), "The job exceeded its option time_limit of 60 s. Raise it, send fewer points or frames, or lower max_reweightings."),
+    "a job out of time": (errors.TimedOut(60.0), "The job exceeded its option time_limit of 60 s. Raise it, or send fewer points or frames."),
     "an unknown token": (errors.UnknownToken("t1"), "There is no token 't1'. `pliant token list` lists all tokens."),
     "newer data": (errors.NewerData(found=9, known=3), "The records were written by a newer Pliant (record format 9; this version reads up to 3). Install that Pliant, or restore a backup that was made before the upgrade."),
 }  # fmt: skip

@@ -78,6 +78,13 @@ def test_every_file_contains_the_name_of_the_job(tmp_path: Path, name: str) -> N
     assert list(getattr(mesh, "geometry", {obj: None})) == [obj]
 
 
+def test_the_camera_of_the_film_has_another_name_than_the_object(tmp_path: Path) -> None:
+    for name, camera in (("face", "camera"), ("camera", "film camera")):
+        file = (write(tmp_path, name) / "shapes.glb").read_bytes()
+        document = json.loads(file[20 : 20 + struct.unpack("<I", file[12:16])[0]])
+        assert [node["name"] for node in document["nodes"]] == [name, camera]
+
+
 def test_point_names_are_in_the_arrays_the_table_and_the_preview(tmp_path: Path) -> None:
     inputs, solution, options = make_result(outputs="mat,csv", truth=True)
     names = tuple(f"Teil {number} ü" for number in range(30))
