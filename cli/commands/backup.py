@@ -34,7 +34,12 @@ def backup(
     settings = read_settings(data, None)
     installation(settings)
     with attended(settings):
-        summary = write_backup(settings, target)
+        try:
+            summary = write_backup(settings, target)
+        except OSError as fault:
+            if fault.filename is None:  # as of a full disk, which may be that of the installation or of the backup
+                fault.filename = str(target)
+            raise
     _show("Backed up", summary, target, as_json=as_json)
 
 

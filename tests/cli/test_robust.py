@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import json
 import math
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -589,6 +591,18 @@ def test_errors_end_with_where_they_are_explained(run: Run, tracks: Path, tmp_pa
     ran = run("solve", tracks, "--frobnicate")
     assert ran.exit_code == Exit.USAGE
     assert "Try 'pliant solve --help' for help." in words(ran), "usage errors lead to the reference of the command"
+
+
+def test_a_full_disk_of_a_backup_is_named(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def full(settings: object, target: Path) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("pliant.worker.maintenance.backup.write_backup", full)
+    monkeypatch.setattr("pliant.worker.processes.valkey.attended", lambda settings: nullcontext())
+    (tmp_path / "data" / "valkey").mkdir(parents=True)
+    ran = run("backup", str(tmp_path / "copy"), "--data", str(tmp_path / "data"))
+    assert ran.exit_code != 0
+    assert f"{tmp_path / 'copy'}: No space left on device." in words(ran)
 
 
 def test_restoring_what_is_no_backup_creates_nothing(tmp_path: Path) -> None:
