@@ -202,19 +202,24 @@ def _golden(search: FocalSearch, middle: Tried) -> list[Tried]:
 def tried_at(search: FocalSearch, focal: float, near: Tried | None) -> Tried | None:
     """Return the isometry at a focal length, started from the depths at `near` or, if that is None, from the conic program.
 
-    None if the program has no solution, or if the surface is stretched along the viewing rays (`MAX_DEPTH_RATIO`).
+    A surface that is stretched along the viewing rays starts again from the conic program. None if the program has no solution, or if the
+    surface is stretched with this start, too.
     """
     graph = search.solved(focal)
-    if near is None:
+    carried = None if near is None else _carried(near.found.depths, graph.seen, focal / near.focal)
+    found = None if carried is None else refine_with_restarts(graph, carried, should_stop=search.should_stop)
+    if found is None or _stretched(graph, found):
         depths = maximum_depth(graph, should_stop=search.should_stop)
-    else:
-        depths = _carried(near.found.depths, graph.seen, focal / near.focal)
-    if depths is None:
-        return None
-    found = refine_with_restarts(graph, depths, should_stop=search.should_stop)
+        if depths is None:
+            return None
+        found = refine_with_restarts(graph, depths, should_stop=search.should_stop)
+    return None if near is not None and _stretched(graph, found) else Tried(focal, graph, found)
+
+
+def _stretched(graph: SurfaceGraph, found: Isometry) -> bool:
+    """Return whether the surface is stretched along the viewing rays (`MAX_DEPTH_RATIO`)."""
     nearest, farthest = np.where(graph.seen, found.depths, np.inf).min(axis=1), found.depths.max(axis=1)
-    stretched = near is not None and bool((farthest > MAX_DEPTH_RATIO * nearest).any())
-    return None if stretched else Tried(focal, graph, found)
+    return bool((farthest > MAX_DEPTH_RATIO * nearest).any())
 
 
 def _carried(depths: Floats, seen: NDArray[np.bool_], ratio: float) -> Floats:

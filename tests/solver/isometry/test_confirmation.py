@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from pliant.solver import Settings, Tracks, gallery, solve
 from pliant.solver.evaluation.trust import Verdict
-from pliant.solver.isometry import surface
+from pliant.solver.isometry import focal_sweep, surface
 from pliant.solver.isometry.confirmation import DISAGREEMENT, disagreement, unlike
 from pliant.solver.isometry.focal_sweep import FocalSearch, Judgement, Tried, tried_at
-from pliant.solver.isometry.refinement import refine
+from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
+from pliant.solver.isometry.refinement import Isometry, refine
 from pliant.solver.isometry.surface import isometric_surface
 from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import never
@@ -112,6 +114,29 @@ def test_weak_evidence_decides_only_against_a_free_surface_that_differs_and_is_n
     kept = with_verdict(good, sheet.tracks, weak, Settings(), monitor, began=0.0)
     assert kept.shapes is good.shapes
     assert kept.choices.reasons["surface"].startswith("Solved as a free surface, whose verdict is good. The evidence")
+
+
+def test_a_stretched_surface_starts_again_from_the_conic_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    search = search_of(rolled(frames=5, side=6).tracks)
+    alone = tried_at(search, FOCAL, None)
+    assert alone is not None
+    beside = tried_at(search, 1.2 * FOCAL, None)
+    assert beside is not None
+    starts: list[NDArray[np.float64]] = []
+
+    def stretched_at_first(graph: SurfaceGraph, depths: NDArray[np.float64], **options: object) -> Isometry:
+        starts.append(depths)
+        exponent = 40 if len(starts) == 1 else 1
+        return Isometry(depths**exponent / depths.max() ** (exponent - 1), alone.found.lengths, 0.0)
+
+    monkeypatch.setattr(focal_sweep, "refine_with_restarts", stretched_at_first)
+    found = tried_at(search, FOCAL, beside)
+    assert found is not None
+    first, again = starts
+    conic = maximum_depth(search.solved(FOCAL))
+    np.testing.assert_array_equal(again, conic)
+    np.testing.assert_array_equal(found.found.depths, conic)
+    assert not np.array_equal(first, again)
 
 
 def test_surfaces_stretched_along_the_rays_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
