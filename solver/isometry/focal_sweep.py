@@ -2,7 +2,7 @@
 
 The inconsistency I is the relative change of the edge lengths from frame to frame. As a function of the focal length, it has its minimum at
 the true one if perspective is strong enough; otherwise it is flat, large or monotone. Each focal length starts from the depths of a
-neighbouring one, the first from the conic program.
+neighbouring one, the first from the conic program. Around a minimum that may be accepted, lengths are those along the surface.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.anchors import Anchors
-from pliant.solver.isometry.bows import bows_of
+from pliant.solver.isometry.arc_lengths import arc_chord_ratios
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import Isometry, refine
 from pliant.solver.isometry.restarts import refine_with_restarts
@@ -70,12 +70,12 @@ class FocalSearch:
 
     should_stop: ShouldStop
 
-    bows: Floats | None = None
-    """`SurfaceGraph.bows` of `frames`, the same for all focal lengths; None if unknown."""
+    arc_ratios: Floats | None = None
+    """`SurfaceGraph.arc_ratios` of `frames`, the same for all focal lengths; None if unknown."""
 
     def solved(self, focal: float) -> SurfaceGraph:
         """Return the rays and edges of `frames` at a focal length."""
-        return replace(self.graph(focal, self.frames), bows=self.bows)
+        return replace(self.graph(focal, self.frames), arc_ratios=self.arc_ratios)
 
     def graph(self, focal: float, frames: NDArray[np.intp] | slice = slice(None)) -> SurfaceGraph:
         """Return the rays and edges of the given frames at a focal length."""
@@ -132,7 +132,7 @@ def _along_surface(search: FocalSearch, tried: list[Tried]) -> tuple[FocalSearch
     All focal lengths share them: their own would make a surface that is stretched along the viewing rays consistent.
     """
     least = least_of(tried)
-    search = replace(search, bows=bows_of(least.graph, least.found))
+    search = replace(search, arc_ratios=arc_chord_ratios(least.graph, least.found))
     graphs = [search.solved(each.focal) for each in tried]
     return search, [
         Tried(each.focal, graph, refine(graph, each.found.depths, should_stop=search.should_stop))

@@ -41,13 +41,14 @@ class SurfaceGraph:
     edges: Indices
     """Pairs of neighbours, shape `(E, 2)`."""
 
-    bows: Floats | None = None
-    """Lengths of the edges along the surface relative to the distances of their ends, shape `(F, E)`; None if unknown, taken as 1."""
+    arc_ratios: Floats | None = None
+    """Arc–chord ratios: lengths of the edges along the surface relative to the distances of their ends, shape `(F, E)`; None if unknown,
+    taken as 1."""
 
     def of(self, frames: Indices) -> SurfaceGraph:
         """Return the graph of these frames."""
-        bows = None if self.bows is None else self.bows[frames]
-        return replace(self, rays=self.rays[frames], confidence=self.confidence[frames], bows=bows)
+        arc_ratios = None if self.arc_ratios is None else self.arc_ratios[frames]
+        return replace(self, rays=self.rays[frames], confidence=self.confidence[frames], arc_ratios=arc_ratios)
 
     @property
     def seen(self) -> NDArray[np.bool_]:

@@ -1,11 +1,11 @@
 """Refinement of depths so that edges keep their lengths from frame to frame.
 
 Minimise Σ_fe ρ(√w_fe (b_fe ‖x_fi − x_fj‖ − l_e)) over log depths ζ and edge lengths l, x_fi = exp(ζ_fi) r_fi, with weights w from the
-confidences of i and j. b is the length along the surface relative to the distance of the ends (`bows`), 1 unless known. ρ is the soft-L1
-loss ε² (√(1 + (r/ε)²) − 1), which limits the influence of observations that do not move with the
-surface. Σ l_e is kept constant, which fixes the free scale. Gauss–Newton steps with Levenberg–Marquardt damping. Only the lengths couple
-the frames, so the depths of each frame are eliminated from the normal equations (Triggs et al., "Bundle Adjustment – A Modern Synthesis",
-2000, section 6.1), and conjugate gradients solve the reduced equations of the lengths.
+confidences of i and j. b is the length along the surface relative to the distance of the ends (`arc_lengths`), 1 unless known. ρ is the
+soft-L1 loss ε² (√(1 + (r/ε)²) − 1), which limits the influence of observations that do not move with the surface. Σ l_e is kept constant,
+which fixes the free scale. Gauss–Newton steps with Levenberg–Marquardt damping. Only the lengths couple the frames, so the depths of each
+frame are eliminated from the normal equations (Triggs et al., "Bundle Adjustment – A Modern Synthesis", 2000, section 6.1), and conjugate
+gradients solve the reduced equations of the lengths.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def edge_lengths(graph: SurfaceGraph, depths: Floats) -> Floats:
     """Return L_fe = b_fe ‖x_fi − x_fj‖, shape `(F, E)`, NaN where an end is hidden."""
     points = depths[..., None] * graph.rays
     lengths = np.linalg.norm(points[:, graph.edges[:, 0]] - points[:, graph.edges[:, 1]], axis=2)
-    if graph.bows is not None:
-        lengths = graph.bows * lengths
+    if graph.arc_ratios is not None:
+        lengths = graph.arc_ratios * lengths
     return np.where(graph.seen[:, graph.edges[:, 0]] & graph.seen[:, graph.edges[:, 1]], lengths, np.nan)
 
 
@@ -97,12 +97,12 @@ def residuals(graph: SurfaceGraph, log_depths: Floats, lengths: Floats) -> tuple
     first, second = graph.ends
     points = np.exp(log_depths)[:, None] * graph.rays[graph.seen]
     apart = points[first] - points[second]
-    if graph.bows is not None:
-        apart *= graph.bows[frame, edge, None]
+    if graph.arc_ratios is not None:
+        apart *= graph.arc_ratios[frame, edge, None]
     length = np.maximum(np.linalg.norm(apart, axis=1), np.finfo(np.float64).tiny)
     along = apart / length[:, None]
-    if graph.bows is not None:
-        along *= graph.bows[frame, edge, None]
+    if graph.arc_ratios is not None:
+        along *= graph.arc_ratios[frame, edge, None]
     towards = (np.einsum("ni,ni->n", along, points[first]), -np.einsum("ni,ni->n", along, points[second]))
     row, root = np.arange(len(edge)), np.sqrt(graph.weights)
     values = np.concatenate([root * each for each in (*towards, -np.ones(len(edge)))])

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.anchors import choose_anchors, connected, nearest_neighbours, unlike_frames
-from pliant.solver.isometry.bows import refine_along_surface
+from pliant.solver.isometry.arc_lengths import refine_along_surface
 from pliant.solver.isometry.confirmation import DECISIVE, DISAGREEMENT, deformation, disagreement
 from pliant.solver.isometry.extension import MIN_ANCHORS, Extended, complete_anchors, extend, flatten
 from pliant.solver.isometry.focal_sweep import CLEAR, FocalSearch, Judgement, Tried, judged, least_of, sweep

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pliant.solver.isometry import bows
+from pliant.solver.isometry import arc_lengths
 from pliant.solver.isometry.anchors import nearest_neighbours
-from pliant.solver.isometry.bows import bows_of, refine_along_surface
+from pliant.solver.isometry.arc_lengths import arc_chord_ratios, refine_along_surface
 from pliant.solver.isometry.inextensible import SurfaceGraph
 from pliant.solver.isometry.refinement import Isometry, edge_lengths, inconsistency, refine, residuals
 from pliant.solver.isometry.splines import partial_splines, spline, spline_basis
@@ -27,13 +27,13 @@ def cylinder(side: int = 7) -> tuple[SurfaceGraph, Isometry, NDArray[np.float64]
     return SurfaceGraph(rays, confidence, edges), Isometry(sheet.points[..., 2], lengths, 0.0), sheet.points
 
 
-def test_bows_of_a_cylinder_turn_distances_into_lengths_along_it() -> None:
+def test_arc_chord_ratios_a_cylinder_turn_distances_into_lengths_along_it() -> None:
     graph, true, _ = cylinder()
     distances = edge_lengths(graph, true.depths)
-    found = bows_of(graph, true)
+    found = arc_chord_ratios(graph, true)
     assert found is not None
     assert np.abs(found * distances - true.lengths).mean() < 0.25 * np.abs(distances - true.lengths).mean()
-    assert inconsistency(edge_lengths(replace(graph, bows=found), true.depths)) < 0.25 * inconsistency(distances)
+    assert inconsistency(edge_lengths(replace(graph, arc_ratios=found), true.depths)) < 0.25 * inconsistency(distances)
 
 
 def test_hidden_points_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -41,15 +41,15 @@ def test_hidden_points_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = np.random.default_rng(0).random(graph.seen.shape) < 0.8
     seen[3] = False
     partly = replace(graph, confidence=seen.astype(float))
-    found = bows_of(partly, replace(true, depths=np.where(seen, true.depths, 0.0)))
+    found = arc_chord_ratios(partly, replace(true, depths=np.where(seen, true.depths, 0.0)))
     assert found is not None
     np.testing.assert_array_equal(found[3], 1.0)
     both = seen[:, graph.edges[:, 0]] & seen[:, graph.edges[:, 1]]
-    whole = bows_of(graph, true)
+    whole = arc_chord_ratios(graph, true)
     assert whole is not None
     np.testing.assert_allclose(found[both], whole[both], atol=0.015)
-    monkeypatch.setattr(bows, "CHUNK_OBSERVATIONS", 1)
-    np.testing.assert_allclose(bows_of(partly, replace(true, depths=np.where(seen, true.depths, 7.0))), found)
+    monkeypatch.setattr(arc_lengths, "CHUNK_OBSERVATIONS", 1)
+    np.testing.assert_allclose(arc_chord_ratios(partly, replace(true, depths=np.where(seen, true.depths, 7.0))), found)
 
 
 def test_partial_splines_are_splines_of_their_known_points() -> None:
@@ -62,11 +62,11 @@ def test_partial_splines_are_splines_of_their_known_points() -> None:
         np.testing.assert_allclose(found[frame], spline(source[some], values[frame, some], target), atol=1e-9)
 
 
-def test_the_jacobian_with_bows_matches_finite_differences() -> None:
+def test_the_jacobian_with_ratios_matches_finite_differences() -> None:
     graph, true, _ = cylinder(5)
     random = np.random.default_rng(0)
     graph = replace(graph, confidence=(random.random(graph.seen.shape) < 0.8) * 1.0)
-    graph = replace(graph, bows=1 + 0.2 * random.random((len(graph.rays), len(graph.edges))))
+    graph = replace(graph, arc_ratios=1 + 0.2 * random.random((len(graph.rays), len(graph.edges))))
     x, count = np.concatenate([np.log(true.depths[graph.seen]), true.lengths]), int(graph.seen.sum())
     jacobian = residuals(graph, x[:count], x[count:])[1].toarray()
     for column in random.choice(len(x), 25, replace=False):
@@ -78,12 +78,12 @@ def test_the_jacobian_with_bows_matches_finite_differences() -> None:
     np.testing.assert_allclose(left, edge_lengths(graph, np.where(graph.seen, true.depths, 0.0))[frame, edge])
 
 
-def test_frames_of_a_graph_keep_their_bows() -> None:
+def test_frames_of_a_graph_keep_their_ratios() -> None:
     graph, true, _ = cylinder(5)
-    bowed = replace(graph, bows=bows_of(graph, true))
+    curved = replace(graph, arc_ratios=arc_chord_ratios(graph, true))
     some = np.array([4, 1])
-    expected = edge_lengths(bowed, true.depths)[some]
-    np.testing.assert_array_equal(edge_lengths(bowed.of(some), true.depths[some]), expected)
+    expected = edge_lengths(curved, true.depths)[some]
+    np.testing.assert_array_equal(edge_lengths(curved.of(some), true.depths[some]), expected)
 
 
 def test_depths_along_the_surface_are_nearer_to_the_true_ones() -> None:
