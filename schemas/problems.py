@@ -198,8 +198,6 @@ class ProblemCode(StrEnum):
     REGION_LOST = auto()
     NO_TEXTURE = auto()
     TRACKS_LOST = auto()
-    OUTSIDE_PICTURE = auto()
-    PRINCIPAL_POINT_FAR = auto()
     UNWRITABLE_FILM = auto()
     STOPPED = auto()
 
@@ -207,6 +205,8 @@ class ProblemCode(StrEnum):
     AMBIGUOUS_LAYOUT = auto()
     AMBIGUOUS_COORDINATES = auto()
     MISSING_IMAGE_SIZE = auto()
+    OUTSIDE_PICTURE = auto()
+    PRINCIPAL_POINT_FAR = auto()
     WRONG_TYPE = auto()
     WRONG_SHAPE = auto()
     OUT_OF_RANGE = auto()
