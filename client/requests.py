@@ -40,7 +40,7 @@ def sharing(days: float) -> ShareRequest:
     """
     try:
         return ShareRequest(expires_in=round(days * DAY))
-    except (ValidationError, OverflowError, ValueError, TypeError) as fault:
+    except (OverflowError, ValueError, TypeError) as fault:
         raise BadArgument(f"days: expected a minute (0.0007) to 366 days, got {days!r}.") from fault
 
 

@@ -6,7 +6,6 @@ The scheme is Standard Webhooks 1.0 (standardwebhooks.com), for which there are 
 from __future__ import annotations
 
 import base64
-import binascii
 import hashlib
 import hmac
 import json
@@ -16,7 +15,6 @@ from collections.abc import Mapping
 
 from pliant.client.errors import BadArgument, InvalidSignature
 from pliant.schemas.job import Job
-from pydantic import ValidationError
 
 PREFIX = "whsec_"
 SHORTEST_KEY = 24
@@ -71,7 +69,7 @@ def verified(
         )
     try:
         key = base64.b64decode(secret.removeprefix(PREFIX), validate=True)
-    except (binascii.Error, ValueError):
+    except ValueError:
         key = b""
     if len(key) < SHORTEST_KEY:  # anybody could sign with an empty one
         raise BadArgument(
@@ -99,7 +97,7 @@ def verified(
         )
     try:
         return Job.model_validate(json.loads(bytes(body))["data"])
-    except (ValueError, KeyError, TypeError, ValidationError) as fault:
+    except (ValueError, KeyError, TypeError) as fault:
         raise InvalidSignature(
             "The message is signed but contains no job. It may come from another service."
         ) from fault

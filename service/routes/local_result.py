@@ -17,7 +17,6 @@ from pliant.service.page import mount_page
 from pliant.service.problems import answer
 from pliant.worker.artifacts.kinds import KINDS
 from pliant.worker.errors import InvalidRequest
-from pydantic import ValidationError
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 ID = "local"
@@ -56,7 +55,7 @@ def read_result(folder: Path) -> Job:
                 "artifacts": [_artifact(path, stated) for path in sorted(folder.iterdir()) if _shown(path, stated)],
             }
         )  # fmt: skip
-    except (ValueError, KeyError, TypeError, AttributeError, ValidationError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise _not_a_result(folder, f"a {REPORT} that Pliant did not write ({type(error).__name__})") from error
 
 

@@ -260,7 +260,7 @@ def read_file(
 def _header_dictionary(text: bytes, field: str) -> dict[str, object]:
     try:
         described = ast.literal_eval(text.decode("utf-8"))
-    except (ValueError, SyntaxError, UnicodeDecodeError, MemoryError, RecursionError) as error:
+    except (ValueError, SyntaxError, MemoryError, RecursionError) as error:
         raise damaged(field, "a NumPy header that is not a Python dictionary") from error
     if not isinstance(described, dict) or set(described) != {"descr", "fortran_order", "shape"}:
         raise damaged(field, "a NumPy header with other entries than descr, fortran_order and shape")

@@ -6,7 +6,6 @@ Morph targets, skins, textures and node transforms are ignored: a job only needs
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 import struct
 from typing import IO, Any
@@ -69,16 +68,7 @@ def _mesh(text: bytes, binary: bytes, field: str, limits: Limits) -> Arrays:
         else:
             indices = np.arange(len(vertices), dtype=np.int64)
         faces = indices[: len(indices) // 3 * 3].astype(np.int64).reshape(-1, 3)
-    except (
-        ValueError,
-        KeyError,
-        IndexError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-        OverflowError,
-        binascii.Error,
-    ) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         reason = f"no entry {error}" if isinstance(error, KeyError) else str(error)[:100]
         raise damaged(field, f"a glTF that cannot be read ({reason})") from error
     if len(faces) > limits.max_faces or len(vertices) > limits.max_points:
