@@ -175,6 +175,7 @@ class Batch:
             The service does not answer.
         """
         from pliant.client.errors import NotAuthorized, PliantError, Unreachable
+        from pliant.client.multipart import sha256
         from pliant.schemas.job import Status
 
         submitted: list[tuple[Row, RemoteJob]] = []
@@ -185,18 +186,19 @@ class Batch:
             self.rows.append(row)
             bar.label = str(file)
             try:
-                film = is_film(file, None)
+                film, name = is_film(file, None), name_of("", file)
                 with as_one_file(file) as sent:
-                    key = _key_of(sent, name_of("", file), common)
+                    key = _key_of(f"{sha256(sent)} {name} {common}")
                     while True:
                         job = client.submit(
-                            None if film else sent, film=sent if film else None, name=name_of("", file), options=self.options,
+                            None if film else sent, film=sent if film else None, name=name, options=self.options,
                             idempotency_key=key, priority=self.priority, timeout=self.timeout,  # type: ignore[arg-type]
                             webhook_secret=secret, on_upload=bar.on_upload, **self.shared,
                         )  # fmt: skip
                         if job.status not in (Status.FAILED, Status.CANCELLED):
                             break
-                        key = _after(key, job.id)  # an earlier job without a result does not prevent another one
+                        # An earlier job without a result does not prevent another one.
+                        key = _key_of(f"{key} after {job.id}")
             except (NotAuthorized, Unreachable):
                 raise
             except PliantError as error:
@@ -279,13 +281,6 @@ class Batch:
         return json.dumps([self.key, self.options, self.priority, parts, digest], sort_keys=True)
 
 
-def _after(key: str, job: str) -> str:
-    """Return the key of the submission that follows a job which failed or was cancelled."""
-    return f"batch/{hashlib.sha256(f'{key} after {job}'.encode()).hexdigest()}"
-
-
-def _key_of(file: Path, name: str, common: str) -> str:
-    """Return the idempotency key of a file: a digest of its content, its name and the shared parameters."""
-    from pliant.client.multipart import sha256
-
-    return f"batch/{hashlib.sha256(f'{sha256(file)} {name} {common}'.encode()).hexdigest()}"
+def _key_of(text: str) -> str:
+    """Return the idempotency key of a submission that a text distinguishes from others."""
+    return f"batch/{hashlib.sha256(text.encode()).hexdigest()}"
