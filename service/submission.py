@@ -112,13 +112,12 @@ def accept(
     if kept is not None:
         form, options, submission = kept.form, kept.options, replace(submission, name=name or kept.job.name)
     if kept is not None and kept.canonical is not None:
-        read = _read_again(kept.job.interpretation, kept.canonical, options, limits)
-        return jobs.submit_once(
-            kept.canonical, replace(submission, options=read.options), interpretation=read.interpretation
-        )
-    canonical = folder / "canonical.npz"
-    films = FilmBounds.of(jobs.settings, max_bytes=limits.max_bytes)
-    read = read_form(form, options, limits, films=films, target=canonical)
+        canonical = kept.canonical
+        read = _read_again(kept.job.interpretation, canonical, options, limits)
+    else:
+        canonical = folder / "canonical.npz"
+        films = FilmBounds.of(jobs.settings, max_bytes=limits.max_bytes)
+        read = read_form(form, options, limits, films=films, target=canonical)
     return jobs.submit_once(canonical, replace(submission, options=read.options), interpretation=read.interpretation)
 
 
