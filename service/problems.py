@@ -170,9 +170,7 @@ def install(app: FastAPI, *, routes: Sequence[BaseRoute], security_headers: Mapp
 
 async def _of_refusal(_: Request, error: Exception) -> Response:
     assert isinstance(error, Refusal)
-    return ProblemResponse(
-        Problem.of(error.code, error.status, detail=error.detail, **error.members), headers=error.headers
-    )
+    return answer(error.code, detail=error.detail, headers=error.headers, status=error.status, **error.members)
 
 
 async def _of_http(request: Request, error: Exception, *, routes: Sequence[Route]) -> Response:
