@@ -47,10 +47,10 @@ class OriginCheck:
         if scope["method"] in _SAFE:
             return None
         origin = headers.get("origin")
+        if origin in self._origins:
+            return None
         from_elsewhere = headers.get("sec-fetch-site") in ("cross-site", "same-site")
-        if origin is not None and origin not in self._origins:
-            from_elsewhere = from_elsewhere or origin.partition("://")[2] != host
-        if from_elsewhere and origin not in self._origins:
+        if from_elsewhere or (origin is not None and origin.partition("://")[2] != host):
             detail = (
                 "A page of another site may not write here. The operator can add its origin to PLIANT_CORS_ORIGINS."
             )
