@@ -178,7 +178,7 @@ def expanded(path: Path | str, name: str) -> Path:
         ) from None
 
 
-def folder_to_fill(path: Path | str, name: str) -> Path:
+def folder_to_fill(path: Path | str) -> Path:
     """Return the path of a folder for files, which need not exist yet, with ``~`` expanded.
 
     Raises
@@ -186,10 +186,10 @@ def folder_to_fill(path: Path | str, name: str) -> Path:
     BadArgument
         There is no such user, or the path is that of a file, or below one.
     """
-    found = expanded(path, name)
+    found = expanded(path, "folder")
     there = next((each for each in (found, *found.parents) if each.exists()), None)
     if there is not None and not there.is_dir():
-        raise BadArgument(f"{name}: expected a folder, got the file {there}. Choose another folder.")
+        raise BadArgument(f"folder: expected a folder, got the file {there}. Choose another folder.")
     return found
 
 

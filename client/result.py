@@ -52,7 +52,7 @@ class Reconstruction:
             self._kept = TemporaryFolder()
             self.folder = self._kept.path
         else:
-            self.folder = folder_to_fill(folder, "folder")
+            self.folder = folder_to_fill(folder)
 
     def __getstate__(self) -> dict[str, Any]:
         files = {"arrays": ARRAYS, "report": REPORT}

@@ -341,7 +341,7 @@ class Client(Connection):
         """
         exchange = self._exchange(timeout, f"the wait for job {job}")
         if folder is not None:
-            folder_to_fill(folder, "folder")  # now, and not after the job has run for minutes
+            folder_to_fill(folder)  # now, and not after the job has run for minutes
         record = succeeded(operations.wait(exchange, job, on_progress=on_progress))
         result = Result(self, record, folder)
         if load:
@@ -487,9 +487,7 @@ class Client(Connection):
         """
         exchange = self._exchange(timeout, f"the download of job {job}")
         record = exchange.record(Call(method="GET", path=job_path(job)), Job)
-        return operations.fetch(
-            exchange, record, folder_to_fill(folder, "folder"), names=names, on_download=on_download
-        )
+        return operations.fetch(exchange, record, folder_to_fill(folder), names=names, on_download=on_download)
 
     def options(self, *, timeout: float | None = None) -> dict[str, Any]:
         """Return the JSON Schema of the options: names, meanings, bounds, defaults."""
