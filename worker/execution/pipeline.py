@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pliant.schemas.job import Artifact, Progress
@@ -92,8 +92,7 @@ def solve_and_write(
     metrics = _metrics(inputs, solution)
     seconds = {**(spent or {}), "solve": solved - began, "metrics": time.perf_counter() - solved}
     report = build_report(inputs, solution, options, metrics=metrics, seconds=seconds, name=name)
-    of_files = file_warnings(options, solution)
-    report["warnings"] = [*inputs.warnings, *report["warnings"], *of_files]
+    report["warnings"] = [*inputs.warnings, *report["warnings"], *file_warnings(options, solution)]
     report["artifacts"] = {each.name: {"bytes": each.bytes, "sha256": each.sha256} for each in earlier}
 
     def exported(done: float) -> None:
@@ -102,23 +101,15 @@ def solve_and_write(
 
     artifacts = write_artifacts(inputs, solution, options, report, directory, name=name, on_progress=exported)
     exported(1.0)
-    done = _finished(solution, metrics, artifacts, camera_sentence=report["camera"]["sentence"])
-    return replace(done, warnings=(*inputs.warnings, *done.warnings, *of_files))
-
-
-def _finished(
-    solution: Solution, metrics: dict[str, float], artifacts: Iterable[Artifact], *, camera_sentence: str
-) -> Finished:
-    trust = solution.trust
     return Finished(
         metrics=metrics,
-        outcome=solution.outcome.value,
-        sentence=solution.outcome.sentence,
-        verdict=None if trust is None else trust.verdict.value,
-        verdict_reasons=() if trust is None else trust.reasons,
-        trust_sentence=None if trust is None else trust.sentence,
-        camera_sentence=camera_sentence,
-        warnings=tuple(solution.choices.warnings),
+        outcome=report["outcome"],
+        sentence=report["sentence"],
+        verdict=report["verdict"],
+        verdict_reasons=tuple(report["verdict_reasons"]),
+        trust_sentence=report["trust_sentence"],
+        camera_sentence=report["camera"]["sentence"],
+        warnings=tuple(report["warnings"]),
         artifacts=tuple(artifacts),
     )
 
