@@ -80,42 +80,23 @@ def run_contained(
     OSError
         ENOSPC: the disk is full, here or for the process.
     """
-    with _Progress(on_line) as progress:
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    with (
+        _Progress(on_line) as progress,
+        tempfile.TemporaryFile() as given,
+        tempfile.TemporaryFile() as answer,
+        tempfile.TemporaryFile() as errors,
+    ):
         stated = dict(request) if progress.target is None else {**request, "progress": progress.target}
         passed = descriptors if progress.target is None else (*descriptors, progress.target)
-        return _run(
-            module, stated, seconds=seconds, directory=directory, descriptors=passed, environment=environment,
-            progress=progress, should_stop=should_stop,
-        )  # fmt: skip
-
-
-def _run(
-    module: str,
-    request: Mapping[str, Any],
-    *,
-    seconds: float,
-    directory: str | None,
-    descriptors: tuple[int, ...],
-    environment: Mapping[str, str] | None,
-    progress: _Progress,
-    should_stop: Callable[[], bool] | None,
-) -> Ended:
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    with tempfile.TemporaryFile() as given, tempfile.TemporaryFile() as answer, tempfile.TemporaryFile() as errors:
-        given.write(json.dumps(dict(request)).encode())
+        given.write(json.dumps(stated).encode())
         given.seek(0)
         process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
             [sys.executable, "-I", "-m", module, str(os.getpid())], env={**(environment or {}), **threads},
-            stdin=given, stdout=answer, stderr=errors, pass_fds=descriptors, cwd=directory,
+            stdin=given, stdout=answer, stderr=errors, pass_fds=passed, cwd=directory,
         )  # fmt: skip
-        overdue = stopped = False
-        until = time.monotonic() + seconds
         try:
-            while process.poll() is None and not (overdue or stopped):
-                overdue = time.monotonic() >= until
-                stopped = should_stop is not None and should_stop()
-                progress.wait(process, until if should_stop is None else min(until, time.monotonic() + POLL))
-            progress.read()
+            overdue, stopped = _wait(process, progress, time.monotonic() + seconds, should_stop)
         finally:
             if process.returncode is None:
                 process.kill()
@@ -126,6 +107,19 @@ def _run(
         errors.seek(max(0, errors.seek(0, os.SEEK_END) - ERRORS_KEPT))
         last = errors.read().decode(errors="replace")
         return Ended(process.returncode, answer.read(MAX_ANSWER + 1), last, overdue, stopped)
+
+
+def _wait(
+    process: subprocess.Popen[bytes], progress: _Progress, until: float, should_stop: Callable[[], bool] | None
+) -> tuple[bool, bool]:
+    """Deliver progress until a process ends, is overdue or should stop; return whether it is overdue, and whether it should stop."""
+    overdue = stopped = False
+    while process.poll() is None and not (overdue or stopped):
+        overdue = time.monotonic() >= until
+        stopped = should_stop is not None and should_stop()
+        progress.wait(process, until if should_stop is None else min(until, time.monotonic() + POLL))
+    progress.read()
+    return overdue, stopped
 
 
 class _Progress:
