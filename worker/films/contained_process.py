@@ -49,7 +49,10 @@ PICTURE_SIDE, PICTURE_QUALITY = 800, 80
 FULL = ("Insufficient memory", "can't start new thread")
 """Messages of OpenCV and Python when the address space is exhausted."""
 
-OPTIONS = ("frames", "template_frame", "grid_step", "longest_side", "region_frame")
+PLANNED = ("template_frame", "grid_step", "longest_side", "region_frame")
+"""Job options that are parameters of the tracker."""
+
+OPTIONS = ("frames", *PLANNED)
 """Fields of a `FilmError` that are job options."""
 
 
@@ -92,13 +95,12 @@ def _answer(request: dict[str, Any]) -> str:
 
 def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
     """Open the film, decode it up to two frames that differ, read the region, and check the options against both."""
-    from pliant.tracking import FilmError, open_film
+    from pliant.tracking import FilmError
     from pliant.tracking.decoding.film import LEAST_FRAMES
     from pliant.tracking.planning.options import check_against
     from pliant.tracking.region import read_region
 
-    options = request["options"]
-    film = open_film(Path(request["film"]), frames=options["frames"], limits=_limits(bounds))
+    film, planned = _opened(request, bounds), _planned(request)
     start, stop, step = film.selection
     count = len(range(film.stated_frames)[start:stop:step]) if film.stated_frames else None
     if count is not None and count > bounds.max_frames:
@@ -116,10 +118,7 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
     region = _region(request)
     if region is not None:
         read_region(region, film.size)
-    check_against(
-        film, region=region is not None, region_frame=options["region_frame"], template_frame=options["template_frame"],
-        grid_step=options["grid_step"], longest_side=options["longest_side"],
-    )  # fmt: skip
+    check_against(film, region=region is not None, **planned)
     facts: dict[str, Any] = {
         "container": film.container, "width": film.size[0], "height": film.size[1], "fps": film.fps / step,
         "stated_frames": film.stated_frames, "frames": count or 0, "seconds": film.stated_frames / film.fps,
@@ -128,10 +127,7 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
     if request["estimate"]:
         from pliant.tracking.estimate import estimate
 
-        expected = estimate(
-            film, region=region, region_frame=options["region_frame"], template_frame=options["template_frame"],
-            grid_step=options["grid_step"], longest_side=options["longest_side"], threads=request["threads"],
-        )  # fmt: skip
+        expected = estimate(film, region=region, threads=request["threads"], **planned)
         facts |= {"points": expected.points, "track_seconds": expected.seconds}
     if request["picture"]:
         facts["first_frame"] = _first_frame(request, bounds)
@@ -151,18 +147,15 @@ def _track(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
     """Track the film; write `tracks.npz`, `contact_sheet.jpg` and `film_frames.bin` into the scratch folder."""
     from pliant.tracking import track_film
 
-    options, folder = request["options"], Path(request["folder"])
+    folder = Path(request["folder"])
     film = _opened(request, bounds)
     tracked = track_film(
         film,
         region=_region(request),
-        region_frame=options["region_frame"],
-        template_frame=options["template_frame"],
-        grid_step=options["grid_step"],
-        longest_side=options["longest_side"],
         threads=request["threads"],
         on_step=_reporter(request["progress"], film.size),
         on_warnings=lambda warnings: _write_line(request["progress"], {"warnings": warnings}),
+        **_planned(request),
     )
     tracked.save_npz(folder / "tracks.npz")
     (folder / "contact_sheet.jpg").write_bytes(tracked.contact_sheet())
@@ -177,6 +170,10 @@ def _opened(request: dict[str, Any], bounds: FilmBounds) -> Film:
     from pliant.tracking import open_film
 
     return open_film(Path(request["film"]), frames=request["options"]["frames"], limits=_limits(bounds))
+
+
+def _planned(request: dict[str, Any]) -> dict[str, Any]:
+    return {name: request["options"][name] for name in PLANNED}
 
 
 def _limits(bounds: FilmBounds) -> FilmLimits:
