@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.errors import TrackingStopped
-from pliant.tracking.flow import Bools, Floats, Grey, Match, dense_flow, match
+from pliant.tracking.flow import Bools, Floats, Grey, Match, best_of, dense_flow, match
 from pliant.tracking.registration import Registration
 
 DELTAS = (1, 8)
@@ -227,12 +227,10 @@ def _advance(
     lost = [m.lost if s == template else m.lost | m.boundary for s, m in zip(links, matches, strict=True)]
     visible = np.stack([state.visible & ~gone for state, gone in zip(states, lost, strict=True)])
     along = np.stack([state.along + m.gap + STEP_VARIANCE for state, m in zip(states, matches, strict=True)])
-    best = np.lexsort((along, ~visible), axis=0)[0]
-    every = np.arange(len(best))
-    points = np.stack([m.points for m in matches])[best, every]
-    points, variance = registration.refine(frame, points, along[best, every], visible[best, every], steps=FIRST_STEPS)
-    seen = appearance.agrees(frame, points, visible[best, every], pool=pool)
-    return _State(points, seen, variance, along[best, every])
+    points, visible, along = best_of(matches, visible, along)
+    points, variance = registration.refine(frame, points, along, visible, steps=FIRST_STEPS)
+    seen = appearance.agrees(frame, points, visible, pool=pool)
+    return _State(points, seen, variance, along)
 
 
 def _store(result: Chain, t: int, state: _State) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -96,6 +96,16 @@ def match(forward: Floats, backward: Floats, points: Floats) -> Match:
     lengths = (step**2).sum(axis=1) + (back**2).sum(axis=1)
     lost = (gap >= CYCLE_RATIO * lengths + CYCLE_FLOOR) | ~in_picture(landed, forward.shape)
     return Match(landed, gap, lost, _on_boundary(backward, landed, back))
+
+
+def best_of(matches: Sequence[Match], visible: Bools, sums: Floats) -> tuple[Floats, Bools, Floats]:
+    """Select one match of each point: a visible one, if there is any, with the smallest sum.
+
+    `visible` and `sums` have one row per match, shape `(M, P)`. Returns the points `(P, 2)`, and their visibility and sums `(P,)`.
+    """
+    best = np.lexsort((sums, ~visible), axis=0)[0]
+    every = np.arange(len(best))
+    return np.stack([m.points for m in matches])[best, every], visible[best, every], sums[best, every]
 
 
 def in_picture(points: Floats, shape: tuple[int, ...]) -> Bools:

@@ -14,7 +14,7 @@ from PIL import Image, UnidentifiedImageError
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.decoding.pictures import upright
 from pliant.tracking.errors import FilmError, TrackingStopped
-from pliant.tracking.flow import Bools, Floats, Grey, dense_flow, match
+from pliant.tracking.flow import Bools, Floats, Grey, best_of, dense_flow, match
 from pliant.tracking.records import OnStep, TrackingStep
 from pliant.tracking.seeding import Seeds, default_step, neighbours
 
@@ -114,10 +114,8 @@ def transport(
         found = [match(there.result(), back.result(), way[1]) for way, (there, back) in zip(ways, flows, strict=True)]
         sees = np.stack([way[2] & ~m.lost for way, m in zip(ways, found, strict=True)])
         sums = np.stack([way[3] + m.gap for way, m in zip(ways, found, strict=True)])
-        best = np.lexsort((sums, ~sees), axis=0)[0]
-        every = np.arange(len(best))
-        points = np.stack([m.points for m in found])[best, every]
-        seen, variance = appearance.agrees(frame, points, sees[best, every]), sums[best, every]
+        points, seen, variance = best_of(found, sees, sums)
+        seen = appearance.agrees(frame, points, seen)
         on_step(TrackingStep("locate", abs(here - start), abs(end - start)))
     return _cover(region, seeds.points[seen], points[seen], default_step(region), read(end).shape)
 
