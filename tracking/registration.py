@@ -159,9 +159,7 @@ class Registration:
 
     def _remaining(self, around: _Surroundings, picture: Floats, points: Floats) -> tuple[Floats, Floats]:
         """Return the variance of all points, square pixels, and the unexplained share of the template's contrast around them."""
-        grey, *slopes = self._cut(picture, points)
-        residual, contrast = around.residual(grey)
-        across, down = (slope / contrast for slope in slopes)
+        residual, across, down = self._compared(around, picture, points)
         parts = [across * across, across * down, down * down, residual * residual]
         xx, xy, yy, left = (self.cells.sums(around.mean(part)) for part in parts)
         least = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
@@ -170,15 +168,15 @@ class Registration:
         unlike = np.maximum(left, 0) / np.maximum(self.cells.sums(around.power), 1e-6)
         return np.asarray(variance, dtype=np.float32), np.asarray(unlike, dtype=np.float32)
 
-    def _cut(self, picture: Floats, points: Floats) -> Floats:
-        """Return grey levels and their derivatives at the samples, shape `(3, S)`, for points `(P, 2)`."""
-        return np.ascontiguousarray(sample(picture, self.cells.places(points)).reshape(-1, 3).T)
+    def _compared(self, around: _Surroundings, picture: Floats, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the residual at the samples, shape `(S,)`, and its derivatives across and down, for points `(P, 2)`."""
+        grey, across, down = np.ascontiguousarray(sample(picture, self.cells.places(points)).reshape(-1, 3).T)
+        residual, contrast = around.residual(grey)
+        return residual, across / contrast, down / contrast
 
     def _step(self, around: _Surroundings, picture: Floats, moved: Floats, flowed: Floats) -> Floats:
         """Return one Gauss–Newton step of all points, shape `(P, 2)`."""
-        grey, *slopes = self._cut(picture, moved)
-        residual, contrast = around.residual(grey)
-        across, down = (slope / contrast for slope in slopes)
+        residual, across, down = self._compared(around, picture, moved)
         some = residual[around.shown > 0]
         scale = 1.4826 * np.median(np.abs(some[:: max(1, len(some) // MEDIAN_OF)])) + np.float32(1e-3)
         weight = around.shown / (1 + (residual / (OUTLIER * scale)) ** 2) / scale**2
