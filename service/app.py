@@ -57,9 +57,8 @@ def create_app(
         version=version("pliant"),
         lifespan=lambda app: _parts(app, jobs_of_all, settings, limits=limits, metrics=metrics),
         openapi_tags=openapi.TAGS,
-        servers=[
-            {"url": ".", "description": "This service"}
-        ],  # relative to the document: a proxy may serve it under a path
+        # Relative to the document: a proxy may serve it under a path.
+        servers=[{"url": ".", "description": "This service"}],
         middleware=middleware(settings, tokens, metrics, jobs_of_all.records),
         docs_url=None,  # FastAPI's page loads Swagger UI from a CDN, which the content-security policy forbids; see `page`
         redoc_url=None,

@@ -74,9 +74,8 @@ class Followers:
         watcher.listeners += 1
         try:
             self._start_reader(jobs.records)  # before the first read, so that no change falls between the two
-            ended = (
-                await run_in_threadpool(jobs.get, id)
-            ).status.final  # before its events, which then include the last
+            # Before its events, which then include the last.
+            ended = (await run_in_threadpool(jobs.get, id)).status.final
             known = await run_in_threadpool(jobs.events, id, after=after)
             last = after or "0-0"
             while True:

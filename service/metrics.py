@@ -169,9 +169,8 @@ class CountRequests:
             try:
                 await self._app(scope, receive, watched)
             except Exception:
-                count(
-                    500, waited=False
-                )  # the response to an unexpected exception is created outside of this middleware
+                # The response to an unexpected exception is created outside of this middleware.
+                count(500, waited=False)
                 raise
 
 

@@ -225,10 +225,8 @@ def document(app: FastAPI) -> dict[str, Any]:
         schemas["Options"] = Options.model_json_schema(ref_template=_REF)
         for model in (OutputRequest, ShareRequest):
             schemas[model.__name__] = model.model_json_schema(ref_template=_REF)
-        for name in (
-            "HTTPValidationError",
-            "ValidationError",
-        ):  # FastAPI's own error format, which this service never uses
+        # FastAPI's own error format, which this service never uses.
+        for name in ("HTTPValidationError", "ValidationError"):
             schemas.pop(name, None)
         text = "Required unless tokens are off. The operator creates tokens with `pliant token create`."
         made["components"]["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer", "description": text}}

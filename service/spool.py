@@ -71,9 +71,8 @@ class Incoming:
         try:
             yield Path(path)
         finally:
-            with anyio.CancelScope(
-                shield=True
-            ):  # removal of gigabytes takes a while, in which the client may disconnect
+            # Removal of gigabytes takes a while, in which the client may disconnect.
+            with anyio.CancelScope(shield=True):
                 await to_thread.run_sync(partial(shutil.rmtree, path, ignore_errors=True))
 
     def abandoned(self) -> list[str]:

@@ -169,9 +169,8 @@ def _from_array(given: NDArray[np.generic]) -> Grey:
             f"shape {given.shape}, dtype {given.dtype}", "Convert the array.",
         )  # fmt: skip
     levels = np.asarray(given, dtype=np.uint8)
-    return (
-        levels * np.uint8(255) if levels.max(initial=0) == 1 else levels
-    )  # 0 and 1, as segmentation models return them
+    # Segmentation models return 0 and 1.
+    return levels * np.uint8(255) if levels.max(initial=0) == 1 else levels
 
 
 def _black_and_white(levels: Grey) -> Grey:

@@ -53,11 +53,8 @@ class AsyncConnection:
                 event_hooks=event_hooks,
                 transport=transport,
             )
-        except (
-            ImportError,
-            OSError,
-            ValueError,
-        ) as fault:  # a SOCKS proxy, a file of certificates, the address of a proxy
+        # A SOCKS proxy, a file of certificates, the address of a proxy.
+        except (ImportError, OSError, ValueError) as fault:
             raise BadArgument(
                 f"The connections cannot be set up: {str(fault).rstrip('.')}. Check verify and the environment variables HTTP_PROXY, "
                 "HTTPS_PROXY, ALL_PROXY, NO_PROXY, SSL_CERT_FILE and SSL_CERT_DIR."

@@ -61,9 +61,8 @@ class Observations:
 
     def with_all(self) -> Observations:
         """Return all observations, including those hidden by `without`, in the same unit and about the same centroids."""
-        seen = np.minimum(
-            self.tracks.visible, self.normalized.full_confidence
-        )  # the most confident one may have been an outlier
+        # The most confident one may have been an outlier.
+        seen = np.minimum(self.tracks.visible, self.normalized.full_confidence)
         return replace(self, normalized=in_units_of(self.normalized, Tracks(self.tracks.points, seen)))
 
     def without_points(self) -> Observations:

@@ -153,9 +153,8 @@ class Jobs:
             places = {attempt_id: place for place, attempt_id in enumerate(self.queue.waiting())}
             places |= dict.fromkeys(self.queue.held())
         jobs = [
-            each.job.model_copy(
-                update={"place_in_queue": places.get(each.attempt_id, 0)}
-            )  # 0: a worker has just taken it
+            # 0: a worker has just taken it.
+            each.job.model_copy(update={"place_in_queue": places.get(each.attempt_id, 0)})
             if each.job.status is Status.QUEUED
             else each.job
             for each in found

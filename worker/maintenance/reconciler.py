@@ -176,9 +176,8 @@ class Reconciler:
         taken = Counter(beat.owner for beat in active.values())
         taken.update(beat.owner for id, beat in queued.items() if id not in absent)
         held: set[str] = set()
-        for id, beat in sorted(
-            absent.items(), key=lambda each: RANKS[each[1].priority]
-        ):  # `ids` returns the oldest first
+        # Those of equal priority stay in the order of `ids`, the oldest first.
+        for id, beat in sorted(absent.items(), key=lambda each: RANKS[each[1].priority]):
             taken[beat.owner] += 1
             most = usual if beat.max_running is None else beat.max_running
             if 0 < most < taken[beat.owner]:

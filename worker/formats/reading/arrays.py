@@ -128,9 +128,8 @@ def read_npz(
                         stream, member.file_size, field=f"{field}.{name}", limits=limits, texts=name in texts
                     )
     except UNREADABLE_ZIP as error:
-        if (
-            isinstance(error, OSError) and error.errno != errno.EINVAL
-        ):  # a directory may point before the file; a disk may fail
+        # A directory may point before the file (EINVAL); otherwise the disk failed.
+        if isinstance(error, OSError) and error.errno != errno.EINVAL:
             raise
         raise damaged(field, f"a zip file that cannot be read ({error})") from error
     return arrays, passed_over

@@ -117,9 +117,8 @@ def _observations(columns: list[str], rows: list[list[float]], *, field: str, li
     tracks[places] = table[:, [index["x"], index["y"]]]
     found: Arrays = {"tracks": tracks.reshape(count, len(names), 2)}
     given = [name for name in CONFIDENCE if name in index]
-    for array, name in zip(
-        ("visibility", "confidence"), given, strict=False
-    ):  # of two, the second multiplies the first
+    # Of two, the second multiplies the first.
+    for array, name in zip(("visibility", "confidence"), given, strict=False):
         values = np.zeros(count * len(names))
         values[places] = table[:, index[name]]
         found[array] = values.reshape(count, len(names))

@@ -99,13 +99,8 @@ def _parse(request: dict[str, Any]) -> str:
     limits = Limits(**request["limits"])
     given, output = request["descriptors"]
     with os.fdopen(given, "rb") as source, os.fdopen(output, "wb") as target:
-        for codec in (
-            "cp437",
-            "utf-8-sig",
-            "latin-1",
-            "ascii",
-            "raw-unicode-escape",
-        ):  # codecs are files too, read on first use
+        # Codecs are files, too, read on first use.
+        for codec in ("cp437", "utf-8-sig", "latin-1", "ascii", "raw-unicode-escape"):
             codecs.lookup(codec)
         limit_process(
             {
