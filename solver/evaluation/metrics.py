@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pliant.solver.agreement import check_type
 from pliant.solver.errors import InvalidInput
-from pliant.solver.evaluation.alignment import Aligned, Kind, align
+from pliant.solver.evaluation.alignment import Aligned, align
 from pliant.solver.limits import frame_chunks
 from pliant.solver.model.so3 import MIRROR, nearest
 from pliant.solver.records import Camera, Floats, Tracks
@@ -120,16 +120,6 @@ def focal_error(camera: Camera, truth: float) -> float:
 def e3d_mocap(shapes: ArrayLike, truth: ArrayLike) -> float:
     """Error of Akhter et al. (2011): mean point distance over mean standard deviation of the truth, see the table above."""
     return _mocap(align(shapes, truth, kind="sequence"))
-
-
-def frame_errors(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -> Floats:
-    """Relative error of every frame, shape `(F,)`; its mean is the metric of that kind."""
-    return align(shapes, truth, kind=kind).relative
-
-
-def point_errors(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame_scaled") -> Floats:
-    """Distance of every point from its true position, shape `(F, P)`, the truth's unit."""
-    return align(shapes, truth, kind=kind).distances
 
 
 def reprojection(tracks: Tracks, solution: Solution) -> Reprojection:

@@ -42,7 +42,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import Mesh, Solution, Tracks
 from pliant.solver.evaluation.alignment import align
-from pliant.solver.evaluation.metrics import frame_errors
 from pliant.solver.evaluation.trust import size_of
 from pliant.solver.mesh import triangles_of
 from pliant.worker.formats.texture import Texture
@@ -221,7 +220,7 @@ def _frames_table(tracks: Tracks, solution: Solution, truth: Floats | None) -> F
     if solution.shapes_std is not None:
         table[:, 3] = np.sqrt(np.square(solution.shapes_std).mean(axis=1)) / size_of(solution.shapes)
     if truth is not None and (known := np.isfinite(truth).all(axis=(0, 2))).sum() >= LEAST_TRUE:
-        table[:, 4] = frame_errors(solution.shapes[:, known], truth[:, known], kind="frame_scaled")
+        table[:, 4] = align(solution.shapes[:, known], truth[:, known], kind="frame_scaled").relative
     for frame in range(count):
         lengths = np.linalg.norm(_residual(tracks, solution, frame)[tracks.visible[frame] > 0], axis=1)
         if len(lengths):

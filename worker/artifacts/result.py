@@ -9,7 +9,7 @@ from math import isclose
 import numpy as np
 from pliant.schemas.options import Options
 from pliant.solver import Solution
-from pliant.solver.evaluation.metrics import point_errors
+from pliant.solver.evaluation.alignment import align
 from pliant.solver.evaluation.trust import size_of
 from pliant.worker.artifacts.animation import MAX_FRAME_TARGETS
 from pliant.worker.artifacts.colours import Painting
@@ -65,7 +65,7 @@ class Result:
     def distances(self) -> Floats | None:
         """Distance of every point from the truth, `(F, P)`, as `e3d_frame_scaled` aligns the two, the truth's unit; None without truth."""
         truth = self.inputs.ground_truth
-        return None if truth is None else point_errors(self.solution.shapes, truth.shapes)
+        return None if truth is None else align(self.solution.shapes, truth.shapes, kind="frame_scaled").distances
 
     @cached_property
     def painting(self) -> Painting | None:

@@ -9,8 +9,7 @@ from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.evaluation.alignment import frobenius
-from pliant.solver.evaluation.metrics import frame_errors
+from pliant.solver.evaluation.alignment import align, frobenius
 from pliant.solver.tracks.matrix import centred
 from pliant.worker.artifacts.geometry import Floats
 from pliant.worker.artifacts.result import Result
@@ -31,10 +30,10 @@ def write_frames_csv(result: Result, file: IO[bytes]) -> None:
     truth = result.inputs.ground_truth
     if truth is not None and result.distances is not None:
         shapes = result.solution.shapes
-        columns["e3d_sequence"] = frame_errors(shapes, truth.shapes, kind="sequence")
-        columns["e3d_frame"] = frame_errors(shapes, truth.shapes, kind="frame")
+        columns["e3d_sequence"] = align(shapes, truth.shapes, kind="sequence").relative
+        columns["e3d_frame"] = align(shapes, truth.shapes, kind="frame").relative
         columns["e3d_frame_scaled"] = np.linalg.norm(result.distances, axis=1) / frobenius(centred(truth.shapes))
-        columns["e3d_frame_similarity"] = frame_errors(shapes, truth.shapes, kind="frame_similarity")
+        columns["e3d_frame_similarity"] = align(shapes, truth.shapes, kind="frame_similarity").relative
         columns["distance_mean"] = result.distances.mean(axis=1)
         columns["distance_max"] = result.distances.max(axis=1)
     _write(file, columns)

@@ -19,8 +19,6 @@ from pliant.solver.evaluation.metrics import (
     e3d_sequence,
     evaluate,
     focal_error,
-    frame_errors,
-    point_errors,
     reprojection,
     rotation_degrees,
 )
@@ -68,9 +66,9 @@ def test_only_per_frame_mirroring_ignores_mirrored_frames():
     flipped = TRUTH.copy()
     flipped[::2] = flipped[::2] @ MIRROR
     assert e3d_frame_similarity(flipped, TRUTH) == pytest.approx(0, abs=1e-13)
-    assert frame_errors(flipped, TRUTH, kind="frame_similarity").max() == pytest.approx(0, abs=1e-13)
+    assert align(flipped, TRUTH, kind="frame_similarity").relative.max() == pytest.approx(0, abs=1e-13)
     # Half of the frames fit exactly and half are mirror images, whichever of the two the sequence's mirror is.
-    errors = np.sort(frame_errors(flipped, TRUTH))
+    errors = np.sort(align(flipped, TRUTH).relative)
     assert errors[:3] == pytest.approx(0, abs=1e-13)
     assert errors[3:].min() > 0.5
     assert e3d_frame(flipped, TRUTH) == pytest.approx(errors[3:].sum() / 6)
@@ -105,7 +103,7 @@ def test_mocap_error_worked_by_hand():
     ours[:, :, 2] = 0.3 * np.array((1, -1, -1, 1))
     assert e3d_mocap(ours, truth) == pytest.approx(0.3 / (2 / 3))
     assert e3d_sequence(ours, truth) == pytest.approx(0.3 / np.sqrt(2))
-    assert point_errors(ours, truth, kind="sequence") == pytest.approx(np.full((3, 4), 0.3))
+    assert align(ours, truth, kind="sequence").distances == pytest.approx(np.full((3, 4), 0.3))
 
 
 def test_more_alignment_freedom_gives_a_lower_error():

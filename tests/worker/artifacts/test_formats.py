@@ -17,7 +17,8 @@ import scipy.io
 import trimesh
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
-from pliant.solver.evaluation.metrics import evaluate, point_errors
+from pliant.solver.evaluation.alignment import align
+from pliant.solver.evaluation.metrics import evaluate
 from pliant.solver.mesh import triangles_of
 from pliant.worker.artifacts import build_report, kinds_for, matlab, write_artifacts
 from pliant.worker.artifacts.colours import STOPS, Painting, linear, shade
@@ -124,7 +125,11 @@ def test_usd_has_a_time_sample_for_every_frame(tmp_path: Path, mesh: str, y_axis
     )
     colours = UsdGeom.PrimvarsAPI(shape).GetPrimvar("displayColor").Get(6)
     np.testing.assert_allclose(
-        colours, linear(Painting.of("", point_errors(solution.shapes, inputs.ground_truth.shapes)).frame(6)), atol=1e-6
+        colours,
+        linear(
+            Painting.of("", align(solution.shapes, inputs.ground_truth.shapes, kind="frame_scaled").distances).frame(6)
+        ),
+        atol=1e-6,
     )
     if mesh == "grid":
         assert set(shape.GetAttribute("faceVertexCounts").Get()) == {4}
@@ -176,7 +181,7 @@ def test_csv_tables_agree_with_the_metrics(tmp_path: Path) -> None:
         assert 0 < frames[name].mean() == pytest.approx(metrics[name], rel=1e-12)
     np.testing.assert_array_equal(frames["seconds"], np.arange(7) / 12.5)
     np.testing.assert_array_equal(points["point"], np.arange(30))
-    distances = point_errors(solution.shapes, inputs.ground_truth.shapes)
+    distances = align(solution.shapes, inputs.ground_truth.shapes, kind="frame_scaled").distances
     np.testing.assert_allclose(frames["distance_mean"], distances.mean(axis=1), rtol=1e-14)
     np.testing.assert_array_equal(points["distance_max"], distances.max(axis=0))
     np.testing.assert_array_equal(frames["reprojection_median"], np.median(solution.residuals, axis=1))
@@ -203,7 +208,7 @@ def test_each_ply_frame_has_its_own_normals_and_colours(tmp_path: Path) -> None:
     made = make_result(truth=True, outputs="ply", normals="animated", colours="error", axes="tracks")
     inputs, solution, _ = made
     files = write(tmp_path, made)
-    distances = point_errors(solution.shapes, inputs.ground_truth.shapes)
+    distances = align(solution.shapes, inputs.ground_truth.shapes, kind="frame_scaled").distances
     top = np.quantile(distances, 0.99)
     assert description(files, "shapes_ply.zip")["colours"]["quantity"] == "distance from the truth"
     assert description(files, "shapes_ply.zip")["colours"]["top"] == pytest.approx(top)

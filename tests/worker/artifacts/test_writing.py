@@ -13,7 +13,7 @@ import pygltflib
 import pytest
 import trimesh
 from khronos import assert_valid
-from pliant.solver.evaluation.metrics import point_errors
+from pliant.solver.evaluation.alignment import align
 from pliant.solver.mesh import triangles_of
 from pliant.worker.artifacts import build_report, write_artifacts
 from pliant.worker.artifacts.animation import animate, leading
@@ -255,7 +255,7 @@ def test_options_reach_the_glb(tmp_path: Path, frames: int) -> None:
     assert primitive.targets[0]["NORMAL"] is not None
     details = gltf.meshes[0].extras["pliant"]["colours"]
     assert inputs.ground_truth is not None
-    mean = point_errors(solution.shapes, inputs.ground_truth.shapes).mean(axis=0)
+    mean = align(solution.shapes, inputs.ground_truth.shapes, kind="frame_scaled").distances.mean(axis=0)
     assert details["quantity"] == "distance from the truth"
     colours = accessor(gltf, primitive.attributes.COLOR_0)
     np.testing.assert_allclose(colours[:, :3], linear(shade(mean / details["top"])), atol=1e-4)
