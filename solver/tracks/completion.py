@@ -252,16 +252,11 @@ def fit_basis(
 
 
 def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> tuple[Floats, Floats, Floats, float]:
-    """Return basis, coefficients (S, r−1), their covariance and the residual scale after `sweeps` robust alternations.
-
-    The weights are those of the Cauchy loss with a scale of three times the residual scale.
-    """
+    """Return basis, coefficients (S, r−1), their covariance and the residual scale after `sweeps` robust alternations."""
     coefficients, _ = coefficients_of(points, weight, basis, None, 1.0, sweeps=3)
     spread, scale = coefficients.T @ coefficients / len(coefficients), MIN_RESIDUAL_SCALE
     for _ in range(sweeps):
-        lengths = _lengths(points - predict(basis, coefficients))
-        scale = max(_typical(lengths, weight), MIN_RESIDUAL_SCALE)
-        robust = weight / (1 + (lengths / (3 * scale)) ** 2)
+        robust, scale = _reweighted(_lengths(points - predict(basis, coefficients)), weight)
         extended = np.concatenate([coefficients, np.ones((len(coefficients), 1))], axis=1)
         normal = extended.T @ (robust[..., None] * extended)
         normal += _ridge(normal)
@@ -299,9 +294,7 @@ def coefficients_of(
         pulled = (robust[..., None] * (points - shift[:, None])).transpose(1, 0, 2).reshape(len(coefficients), -1)
         coefficients = _solved(normal, pulled @ columns.reshape(-1, size))
         if sweep + 1 < sweeps:
-            lengths = _lengths(points - predict(basis, coefficients))
-            typical = max(_typical(lengths, weight), MIN_RESIDUAL_SCALE)
-            robust = weight / (1 + (lengths / (3 * typical)) ** 2)
+            robust, _ = _reweighted(_lengths(points - predict(basis, coefficients)), weight)
     return coefficients, normal
 
 
@@ -386,8 +379,7 @@ def _widen(basis: Floats, points: Floats, weight: Floats, start: Floats, rank: i
     else:
         coefficients, _ = coefficients_of(points, weight, basis, None, 1.0, sweeps=2)
         left = points - predict(basis, coefficients)
-        scale = max(_typical(_lengths(left), weight), MIN_RESIDUAL_SCALE)
-        left *= (weight / (1 + (_lengths(left) / (3 * scale)) ** 2))[..., None]
+        left *= _reweighted(_lengths(left), weight)[0][..., None]
         old, shift = basis[:, :, :-1], basis[:, :, -1]
     stacked = columns(centred(left))
     vectors = _leading(stacked, rank - 1 - old.shape[2])
@@ -418,6 +410,12 @@ def _ridge(normal: Floats, share: float = COEFFICIENT_RIDGE) -> Floats:
 
 def _lengths(difference: Floats) -> Floats:
     return np.asarray(np.sqrt(difference[..., 0] ** 2 + difference[..., 1] ** 2))
+
+
+def _reweighted(lengths: Floats, weight: Floats) -> tuple[Floats, float]:
+    """Return the weights of the Cauchy loss for residuals of these lengths, at three times the residual scale, and that scale."""
+    scale = max(_typical(lengths, weight), MIN_RESIDUAL_SCALE)
+    return weight / (1 + (lengths / (3 * scale)) ** 2), scale
 
 
 def _typical(lengths: Floats, weight: Floats) -> float:
