@@ -57,12 +57,11 @@ def extended(
     enter(should_stop, "extension")
     frames = len(observations.normalized.points)
     turning = observations.turning
-    scales, thin = estimate.scales, estimate.rotations
+    scales, rotations = estimate.scales, estimate.rotations
     with_scales = bool((scales != 1).any()) and observations.known_scales is None
-    shapes = MeanShapes.of(covariance, thin, scales, estimate.sample)
-    chosen = estimate.sampled
-    views = _views(observations, estimate, chosen)
-    poses = interpolated(used, thin, scales, covariance.modes, frames)
+    shapes = MeanShapes.of(covariance, rotations, scales, estimate.sample)
+    views = _views(observations, estimate)
+    poses = interpolated(used, rotations, scales, covariance.modes, frames)
     if observations.known is not None:
         poses = replace(poses, rotations=np.array(observations.known.rotations))
         if observations.known_scales is not None:
@@ -79,11 +78,11 @@ def extended(
     return _whole(estimate, covariance, observations, views, shapes, poses, begun)
 
 
-def _views(observations: Observations, estimate: CameraEstimate, chosen: NDArray[np.intp]) -> Views:
+def _views(observations: Observations, estimate: CameraEstimate) -> Views:
     """Return the tracks of the sampled points, relative to the principal point if perspective is corrected."""
     normalized, view = observations.normalized, estimate.perspective
-    points = normalized.points[:, chosen].transpose(0, 2, 1)
-    weight = normalized.visible[:, chosen]
+    points = normalized.points[:, estimate.sampled].transpose(0, 2, 1)
+    weight = normalized.visible[:, estimate.sampled]
     if view is None or not view.is_perspective or observations.lens is None:
         return Views(np.ascontiguousarray(points), weight)
     return Views(points + observations.lens.offsets[:, :, None], weight, view.inverse_focal)
