@@ -17,7 +17,7 @@ from pliant.solver.cameras.perspective import Perspective, corrected, depth_map
 from pliant.solver.model.expectation_maximisation import ModelOrder, learned
 from pliant.solver.model.observation_model import ImageDensity, inlier_probabilities
 from pliant.solver.pulse import ShouldStop, never
-from pliant.solver.records import Floats
+from pliant.solver.records import Floats, projections_of
 from pliant.solver.refinement.learned import START_EM_ROUNDS, Learned, Refinement
 from pliant.solver.tracks.completion import often_visible
 from pliant.solver.tracks.matrix import columns, gram_of, points_of
@@ -107,8 +107,7 @@ def cross_fitted(
     should_stop : callable, optional
         Called between rounds of EM.
     """
-    scales = estimate.scales[used]
-    projections = estimate.rotations[used, :2] * scales[:, None, None]
+    projections = projections_of(estimate.rotations[used], estimate.scales[used])
     points = observed.points - estimate.translations[used, None]
     points = np.where(observed.confidence[..., None] > 0, points, 0.0)
     part = np.random.default_rng(seed).permutation(points.shape[1]) % FOLDS
