@@ -251,36 +251,8 @@ class KnownCamera:
                     "cameras.principal_point", "not_finite", "two finite numbers", str(principal_point), "Give x and y."
                 )
             principal_point = (float(point[0]), float(point[1]))
-        given = numeric(rotations, "rotations", "Give one rotation a frame.").astype(np.float64)
-        if given.ndim != 3 or given.shape[1:] not in ((2, 3), (3, 3)) or len(given) == 0:
-            raise wrong_input(
-                "rotations",
-                "wrong_shape",
-                "(frames, 2, 3) or (frames, 3, 3)",
-                shape_text(given),
-                "Give one rotation a frame.",
-            )
-        rows = given[:, :2]
-        with np.errstate(over="ignore", invalid="ignore"):
-            error = np.abs(rows @ rows.transpose(0, 2, 1) - np.eye(2)).max()
-        if not error <= 1e-3:  # also rejects NaN
-            raise wrong_input(
-                "rotations", "not_a_rotation", "orthonormal rows", f"a deviation of {error:.3g}",
-                "Rows must have length 1 and be perpendicular; scales are given separately.",
-            )  # fmt: skip
-        left, _, right = np.linalg.svd(rows, full_matrices=False)
-        rows = left @ right
-        third = np.cross(rows[:, 0], rows[:, 1])
-        if given.shape[1] == 3 and not np.abs(given[:, 2] - third).max() <= 1e-3:
-            mirrored = np.abs(given[:, 2] + third).max() <= 1e-3
-            raise wrong_input(
-                "rotations", "not_a_rotation", "a third row that is the cross product of the first two",
-                "its negative: the determinants are -1" if mirrored else "another row",
-                "Leave out the third row, shape (frames, 2, 3), if the axes are left-handed.",
-            )  # fmt: skip
-        complete = np.concatenate([rows, third[:, None]], axis=1)
-        read_only(complete)
-        factors = None if scales is None else _positive_scales(scales, len(given))
+        complete = _orthonormal(rotations)
+        factors = None if scales is None else _positive_scales(scales, len(complete))
         return cls(complete, factors, focal, principal_point)
 
 
@@ -358,6 +330,35 @@ class Choices:
     """Warnings for the user, e.g. that the camera hardly moved."""
     focal_lengths: tuple[tuple[float, float], ...] = ()
     """Focal lengths compared for an isometric surface, pixels, each with its isometric inconsistency I; empty if this was not tested."""
+
+
+def _orthonormal(rotations: ArrayLike) -> Floats:
+    """Return exact rotations `(F, 3, 3)`, read-only, for rows that are orthonormal to within 1e-3."""
+    hint = "Give one rotation a frame."
+    given = numeric(rotations, "rotations", hint).astype(np.float64)
+    if given.ndim != 3 or given.shape[1:] not in ((2, 3), (3, 3)) or len(given) == 0:
+        raise wrong_input("rotations", "wrong_shape", "(frames, 2, 3) or (frames, 3, 3)", shape_text(given), hint)
+    rows = given[:, :2]
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(rows @ rows.transpose(0, 2, 1) - np.eye(2)).max()
+    if not error <= 1e-3:  # also rejects NaN
+        raise wrong_input(
+            "rotations", "not_a_rotation", "orthonormal rows", f"a deviation of {error:.3g}",
+            "Rows must have length 1 and be perpendicular; scales are given separately.",
+        )  # fmt: skip
+    left, _, right = np.linalg.svd(rows, full_matrices=False)
+    rows = left @ right
+    third = np.cross(rows[:, 0], rows[:, 1])
+    if given.shape[1] == 3 and not np.abs(given[:, 2] - third).max() <= 1e-3:
+        mirrored = np.abs(given[:, 2] + third).max() <= 1e-3
+        raise wrong_input(
+            "rotations", "not_a_rotation", "a third row that is the cross product of the first two",
+            "its negative: the determinants are -1" if mirrored else "another row",
+            "Leave out the third row, shape (frames, 2, 3), if the axes are left-handed.",
+        )  # fmt: skip
+    complete = np.concatenate([rows, third[:, None]], axis=1)
+    read_only(complete)
+    return complete
 
 
 def _positive_scales(scales: ArrayLike, frames: int) -> Floats:
