@@ -185,10 +185,15 @@ class Uploads:
     def _folder(self, id: str) -> Path:
         if not is_id(id):
             raise UnknownUpload(id[:80])
-        return self.directory / hashlib.sha256(self.owner.encode()).hexdigest()[:32] / id
+        return self.directory / self._owner / id
+
+    @property
+    def _owner(self) -> str:
+        """Name of the owner in paths and keys."""
+        return hashlib.sha256(self.owner.encode()).hexdigest()[:32]
 
     def _check_number(self) -> None:
-        owners = self.directory / hashlib.sha256(self.owner.encode()).hexdigest()[:32]
+        owners = self.directory / self._owner
         if owners.exists() and sum(1 for _ in owners.iterdir()) >= MAX_UPLOADS:
             raise TooManyUploads(MAX_UPLOADS)
 

@@ -6,7 +6,6 @@ names it, and only the newest request may add one, so neither locks nor repairs 
 
 from __future__ import annotations
 
-import hashlib
 import secrets
 import time
 from collections.abc import Iterator
@@ -164,10 +163,6 @@ class SharedUploads(Uploads):
             return False
         self.blobs.delete(f"{FOLDER}{name}/{state.generation}/")
         return True
-
-    @property
-    def _owner(self) -> str:
-        return hashlib.sha256(self.owner.encode()).hexdigest()[:32]
 
     def _state(self, id: str) -> State | None:
         return self.states.get(self.name(id))
