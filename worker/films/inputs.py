@@ -17,7 +17,7 @@ from pliant.worker.formats.texture import Texture
 from pliant.worker.formats.tracks.decimation import thin
 from pliant.worker.formats.tracks.frame_times import ARRAY as TIMES
 from pliant.worker.formats.tracks.frame_times import read_frame_times
-from pliant.worker.formats.tracks.selection import hide_sparsely_observed
+from pliant.worker.formats.tracks.selection import LEFT_OUT_LISTED, hide_sparsely_observed
 from pliant.worker.formats.unused_options import notes_on_options
 
 REQUIRED = frozenset(("tracks", "visibility", "confidence", "grid", TIMES))
@@ -52,7 +52,7 @@ def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
         num_frames=checked.num_frames, num_points=checked.num_points, num_faces=0 if mesh is None else len(mesh.faces),
         hidden_fraction=hidden, mesh_source="film", has_ground_truth=False, has_rotations=False, layout="tracks (F, P, 2)",
         format=f"film ({tracked.container})", image_size=options.image_size, fps=tracked.fps, given_points=given,
-        num_left_out=len(left_out), left_out_points=left_out[:1000].tolist(),
+        num_left_out=len(left_out), left_out_points=left_out[:LEFT_OUT_LISTED].tolist(),
         estimate=estimated(checked.num_frames, checked.num_points, options),
         notes=[*notes_on_options(options, film=True), *notes_on_rate(tracked.container), *notes, *how, *sparse, *tracked.warnings],
     )  # fmt: skip

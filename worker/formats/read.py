@@ -25,12 +25,9 @@ from pliant.worker.formats.solver_settings import solver_settings
 from pliant.worker.formats.tracks.decimation import thin
 from pliant.worker.formats.tracks.film_tracks import FilmTracks, read_film_tracks, tracks_options
 from pliant.worker.formats.tracks.interpretation import Understood, understand
-from pliant.worker.formats.tracks.selection import chosen_frames, hide_sparsely_observed
+from pliant.worker.formats.tracks.selection import LEFT_OUT_LISTED, chosen_frames, hide_sparsely_observed
 from pliant.worker.formats.tracks.tracker_formats import KNOWN, OWN, TRACKS, TRUE_ROTATIONS
 from pliant.worker.formats.unused_options import notes_on_options
-
-LISTED = 1000
-"""Maximum number of hidden points that the interpretation lists by index."""
 
 
 def read_inputs(
@@ -159,7 +156,7 @@ def _interpretation(
         mesh_source=chosen.source, mesh_grid=chosen.grid, has_ground_truth=has_truth, has_rotations=has_rotations,
         layout=understood.layout, format=understood.format, coordinates=understood.coordinates, y_axis=understood.y_axis,
         given_frames=frames, given_points=points,
-        num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(), notes=notes,
+        num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LEFT_OUT_LISTED].tolist(), notes=notes,
         **({} if film is None else _stated(film, chosen.selection)),
     )  # fmt: skip
 

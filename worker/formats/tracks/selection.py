@@ -11,6 +11,9 @@ from pliant.solver.records import MIN_FRAMES
 LISTED_POINTS = 10
 """Maximum number of point indices listed in a note."""
 
+LEFT_OUT_LISTED = 1000
+"""Maximum number of excluded points that the interpretation lists by index."""
+
 
 def chosen_frames(text: str | None, num_frames: int, *, timed: bool = False) -> tuple[NDArray[np.intp], list[str]]:
     """Resolve the option `frames`, start:stop:step as Python counts.
