@@ -25,7 +25,7 @@ from pliant.worker.formats.solver_settings import solver_settings
 from pliant.worker.formats.tracks.decimation import thin
 from pliant.worker.formats.tracks.film_tracks import FilmTracks, read_film_tracks, tracks_options
 from pliant.worker.formats.tracks.interpretation import Understood, understand
-from pliant.worker.formats.tracks.selection import LEFT_OUT_LISTED, chosen_frames, hide_sparsely_observed
+from pliant.worker.formats.tracks.selection import LEFT_OUT_LISTED, chosen_frames, hide_sparsely_observed, selected
 from pliant.worker.formats.tracks.tracker_formats import KNOWN, OWN, TRACKS, TRUE_ROTATIONS
 from pliant.worker.formats.unused_options import notes_on_options
 
@@ -194,14 +194,14 @@ def _choose(
     points, visible = understood.points, understood.visible
     picked = np.arange(whole[1]) if surface.points is None else surface.points
     if len(frames) < whole[0]:
-        points, visible = points[frames], None if visible is None else visible[frames]
+        points, visible = selected(points, visible, np.s_[frames])
     if len(picked) < whole[1]:
-        points, visible = points[:, picked], None if visible is None else visible[:, picked]
+        points, visible = selected(points, visible, np.s_[:, picked])
     _check_range(points, visible)
     check_order(surface, points, visible)
     kept, made, how = thin(points, visible, surface.mesh, options)
     if len(kept) < len(picked):
-        points, visible = points[:, kept], None if visible is None else visible[:, kept]
+        points, visible = selected(points, visible, np.s_[:, kept])
     _check_size(points, limits)
     source = surface.source
     more: list[str] = []
@@ -258,13 +258,11 @@ def _read_truth(
     raw = read_truth(given, understood, limits=limits)
     if raw is None:
         return None, []
-    like = (len(selection.frames), len(selection.points))
-    shapes = raw.shapes
-    if shapes.shape == (*selection.whole, 3):
-        shapes = shapes[np.ix_(selection.frames, selection.points)] if selection.narrows else shapes
-    else:
-        like = selection.whole
-    turned = raw.rotations
+    shapes, turned, like = raw.shapes, raw.rotations, selection.whole
+    if shapes.shape == (*like, 3):
+        like = (len(selection.frames), len(selection.points))
+        if selection.narrows:
+            shapes = shapes[np.ix_(selection.frames, selection.points)]
     if turned is not None and turned.ndim == 3 and len(turned) == selection.whole[0]:
         turned = turned[selection.frames]
     try:

@@ -22,6 +22,7 @@ from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Mesh
 from pliant.solver.mesh import triangles_of
 from pliant.solver.records import MIN_POINTS
+from pliant.worker.formats.tracks.selection import selected
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array  # imported only where a mesh is thinned, which few inputs need
@@ -73,10 +74,8 @@ def _thinned(
         kept = np.arange(0, count, stride)
         how = f"one in {stride}" if stride > 1 else "all"
         if len(kept) > limit:
-            kept, how = (
-                kept[spread(*_places(points[:, kept], visible if visible is None else visible[:, kept]), limit)],
-                "spread evenly",
-            )
+            places, seen = _places(*selected(points, visible, np.s_[:, kept]))
+            kept, how = kept[spread(places, seen, limit)], "spread evenly"
         empty = None if mesh is None else Mesh.from_faces(np.zeros((0, 3), np.int32), len(kept))
         return kept, empty, [f"{len(kept)} of {count} points are used: {how}."]
     return _thin_mesh(points, visible, mesh, min(limit, math.ceil(count / stride)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options
@@ -37,6 +39,13 @@ def chosen_frames(text: str | None, num_frames: int, *, timed: bool = False) -> 
     if step is not None and step > 1 and not timed:
         note += f"; one in {step}, so at the same fps the animation runs {step} times as fast"
     return frames, [f"{note}."]
+
+
+def selected(
+    points: NDArray[np.generic], visible: NDArray[np.float64] | None, index: Any
+) -> tuple[NDArray[np.generic], NDArray[np.float64] | None]:
+    """Return points `(F, P, 2)` and visibility `(F, P)` at an index of frames and points."""
+    return points[index], None if visible is None else visible[index]
 
 
 def hide_sparsely_observed(
