@@ -12,6 +12,7 @@ A final status never changes: running a finished job again is a new job (`again`
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime, timedelta
 
 from pliant.schemas.job import Job, Problem, Progress, Status
@@ -49,10 +50,8 @@ def claim(stored: Stored, *, attempt_id: str, worker: str, now: datetime) -> Sto
         return stored
     if stored.attempt_id != attempt_id or stored.job.status is not Status.QUEUED:
         raise StaleAttempt(stored.job.id)
-    job = stored.job.model_copy(
-        update={"status": Status.RUNNING, "started_at": now, "attempt": stored.job.attempt + 1, "progress": None}
-    )
-    return stored.model_copy(update={"job": job, "worker": worker})
+    begun = {"status": Status.RUNNING, "started_at": now, "attempt": stored.job.attempt + 1, "progress": None}
+    return _changed(stored, begun, worker=worker)
 
 
 def report(stored: Stored, *, attempt_id: str, progress: Progress) -> Stored:
@@ -64,7 +63,7 @@ def report(stored: Stored, *, attempt_id: str, progress: Progress) -> Stored:
         The job belongs to another attempt, or is finished.
     """
     _check_owner(stored, attempt_id)
-    return stored.model_copy(update={"job": stored.job.model_copy(update={"progress": progress})})
+    return _changed(stored, {"progress": progress})
 
 
 def succeed(
@@ -96,9 +95,8 @@ def succeed(
         **({} if finished.interpretation is None else {"interpretation": finished.interpretation}),
         **({} if finished.options is None else {"options": finished.options}),
     }
-    job = stored.job.model_copy(update=update)
     size = stored.bytes + sum(each.bytes for each in finished.artifacts)
-    published = stored.model_copy(update={"job": job, "prefix": prefix, "bytes": size})
+    published = _changed(stored, update, prefix=prefix, bytes=size)
     return _finish(published, Status.SUCCEEDED, now=now, retention=retention)
 
 
@@ -113,8 +111,7 @@ def fail(stored: Stored, *, attempt_id: str, problem: Problem, now: datetime, re
     _check_owner(stored, attempt_id)
     if stored.job.status is Status.CANCELLING:
         return stop(stored, attempt_id=attempt_id, now=now, retention=retention)
-    job = stored.job.model_copy(update={"error": problem})
-    return _finish(stored.model_copy(update={"job": job}), Status.FAILED, now=now, retention=retention)
+    return _finish(_changed(stored, {"error": problem}), Status.FAILED, now=now, retention=retention)
 
 
 def stop(stored: Stored, *, attempt_id: str, now: datetime, retention: float) -> Stored:
@@ -143,7 +140,7 @@ def cancel(stored: Stored, *, now: datetime, retention: float) -> Stored:
     if status is Status.QUEUED:
         return _finish(stored, Status.CANCELLED, now=now, retention=retention)
     if status is Status.RUNNING:
-        return stored.model_copy(update={"job": stored.job.model_copy(update={"status": Status.CANCELLING})})
+        return _changed(stored, {"status": Status.CANCELLING})
     if status in (Status.CANCELLING, Status.CANCELLED):
         return stored
     raise NotAllowedNow(
@@ -174,9 +171,9 @@ def requeue(
     spent = max_attempts is not None and stored.job.attempt - stored.stops >= max_attempts
     if spent or stored.job.status is Status.CANCELLING:
         return fail(stored, attempt_id=attempt_id, problem=problem, now=now, retention=retention)
-    job = stored.job.model_copy(update={"status": Status.QUEUED, "started_at": None, "progress": None})
+    waiting = {"status": Status.QUEUED, "started_at": None, "progress": None}
     stops = stored.stops + (max_attempts is None)
-    return stored.model_copy(update={"job": job, "attempt_id": fresh, "worker": None, "stops": stops})
+    return _changed(stored, waiting, attempt_id=fresh, worker=None, stops=stops)
 
 
 def redeliver(stored: Stored, *, attempt_id: str, fresh: str) -> Stored:
@@ -199,5 +196,8 @@ def _check_owner(stored: Stored, attempt_id: str) -> None:
 
 def _finish(stored: Stored, status: Status, *, now: datetime, retention: float) -> Stored:
     expires = now + timedelta(seconds=retention) if retention > 0 else None
-    job = stored.job.model_copy(update={"status": status, "finished_at": now, "expires_at": expires})
-    return stored.model_copy(update={"job": job})
+    return _changed(stored, {"status": status, "finished_at": now, "expires_at": expires})
+
+
+def _changed(stored: Stored, of_job: Mapping[str, object], **of_record: object) -> Stored:
+    return stored.model_copy(update={"job": stored.job.model_copy(update=of_job), **of_record})
