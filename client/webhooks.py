@@ -63,19 +63,7 @@ def verified(
             f"body: expected the bytes of the request, got a value of type {type(body).__name__}. "
             "Pass the body as it arrived, before it is decoded or parsed."
         )
-    if not isinstance(secret, str):
-        raise BadArgument(
-            f"secret: expected the value passed as webhook_secret, got a value of type {type(secret).__name__}."
-        )
-    try:
-        key = base64.b64decode(secret.removeprefix(PREFIX), validate=True)
-    except ValueError:
-        key = b""
-    if len(key) < SHORTEST_KEY:  # anybody could sign with an empty one
-        raise BadArgument(
-            f"secret: expected {PREFIX} followed by {SHORTEST_KEY} bytes or more in base64, got something else. "
-            "Use the value passed as webhook_secret."
-        )
+    key = _key_of(secret)
     given = {name.lower(): value for name, value in headers.items()}
     try:
         name, moment, signatures = given["webhook-id"], given["webhook-timestamp"], given["webhook-signature"]
@@ -101,3 +89,21 @@ def verified(
         raise InvalidSignature(
             "The message is signed but contains no job. It may come from another service."
         ) from fault
+
+
+def _key_of(secret: str) -> bytes:
+    """Return the bytes of a secret."""
+    if not isinstance(secret, str):
+        raise BadArgument(
+            f"secret: expected the value passed as webhook_secret, got a value of type {type(secret).__name__}."
+        )
+    try:
+        key = base64.b64decode(secret.removeprefix(PREFIX), validate=True)
+    except ValueError:
+        key = b""
+    if len(key) < SHORTEST_KEY:  # anybody could sign with an empty one
+        raise BadArgument(
+            f"secret: expected {PREFIX} followed by {SHORTEST_KEY} bytes or more in base64, got something else. "
+            "Use the value passed as webhook_secret."
+        )
+    return key
