@@ -13,9 +13,9 @@ from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.formats.reading.pose_tables import (
     CONFIDENCE,
     LONGEST_ROW,
-    MAX_GAPS,
     SEPARATORS,
     cells,
+    check_full_table,
     columns_of,
     deeplabcut_columns,
     not_a_table,
@@ -97,12 +97,7 @@ def _observations(columns: list[str], rows: list[list[float]], *, field: str, li
     frames = (numbers[:, 0] - numbers[:, 0].min()).astype(np.int64)
     names, points = np.unique(numbers[:, 1].astype(np.int64), return_inverse=True)
     count = int(frames.max()) + 1
-    if count * len(names) * 16 > limits.max_bytes or count > MAX_GAPS * len(table):
-        raise too_large(
-            field,
-            expected=f"at most {limits.max_bytes:,} bytes as a full table",
-            got=f"{count:,} frames × {len(names):,} points",
-        )
+    check_full_table(field, (count, len(names)), size=count * len(names) * 16, rows=len(table), limits=limits)
     places = frames * len(names) + points
     ordered = np.sort(places)  # for 3 million observations 70 times as fast as `np.unique`, which hashes them
     again = np.flatnonzero(ordered[1:] == ordered[:-1])

@@ -182,12 +182,7 @@ def read_rows(
     if rows and np.isfinite(frames).all():
         places = _places(np.array(frames), field)
     count = int(places.max(initial=-1)) + 1
-    if count * len(wanted) * 8 > limits.max_bytes or count > MAX_GAPS * len(rows):
-        raise too_large(
-            field,
-            expected=f"at most {limits.max_bytes:,} bytes as a full table",
-            got=f"{count:,} frames × {points:,} points",
-        )
+    check_full_table(field, (count, points), size=count * len(wanted) * 8, rows=len(rows), limits=limits)
     table = np.full((count, len(wanted)), np.nan)
     table[places] = np.array(rows, dtype=np.float64).reshape(len(rows), len(wanted))
     found: Arrays = {columns.writer: np.stack([table[:, :points], table[:, points : 2 * points]], axis=2)}
@@ -196,6 +191,22 @@ def read_rows(
         found["likelihood"][:, list(seen)] = table[:, 2 * points :]
         found["likelihood"][np.setdiff1d(np.arange(count), places)] = 0.0
     return {**found, **found_names(columns.names)}
+
+
+def check_full_table(field: str, shape: tuple[int, int], *, size: int, rows: int, limits: Limits) -> None:
+    """Check a table of `rows` lines, which takes `size` bytes with all frames and points of its shape.
+
+    Raises
+    ------
+    InvalidInput
+        Code too_large.
+    """
+    if size > limits.max_bytes or shape[0] > MAX_GAPS * rows:
+        raise too_large(
+            field,
+            expected=f"at most {limits.max_bytes:,} bytes as a full table",
+            got=f"{shape[0]:,} frames × {shape[1]:,} points",
+        )
 
 
 def _number_or_nan(cell: str, separator: str) -> float:
