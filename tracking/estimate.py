@@ -14,7 +14,7 @@ from pliant.tracking.flow import Bools, Grey, dense_flow, opencv_serial
 from pliant.tracking.region import LONG_STEP, Region, read_region
 from pliant.tracking.registration import Registration
 from pliant.tracking.seeding import Seeds, default_step, neighbours, place
-from pliant.tracking.survey import middle_of, tracking_scale
+from pliant.tracking.survey import middle_of, tracking_size
 
 FLOWS = 2 * (1 + len(DELTAS))
 """Flows per frame: forward and backward, from the template and from each earlier frame."""
@@ -87,8 +87,7 @@ def _frame(film: Film, index: int, longest_side: int) -> tuple[Grey, float]:
         if frame.index >= index:
             break
     assert image is not None, "a film without frames is refused when it is opened"
-    scale = tracking_scale(film.size, longest_side)
-    size = (max(16, round(film.size[0] * scale)), max(16, round(film.size[1] * scale)))
+    scale, size = tracking_size(film.size, longest_side)
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8), scale
 

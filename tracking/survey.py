@@ -77,8 +77,7 @@ def survey(
     TrackingStopped
         `should_stop` returned True.
     """
-    scale = tracking_scale(film.size, longest_side)
-    size = (max(16, round(film.size[0] * scale)), max(16, round(film.size[1] * scale)))
+    scale, size = tracking_size(film.size, longest_side)
     indices, times, sharpness, likeness = [], [], [], [1.0]
     before: Grey | None = None
     whole = film if reached is None else film.reaching(reached)
@@ -115,6 +114,12 @@ def tracking_scale(size: tuple[int, int], longest_side: int) -> float:
     if longest > longest_side:
         return longest_side / longest
     return float(np.clip(min(ENLARGED_TO, longest_side) / longest, 1.0, LARGEST_ENLARGEMENT))
+
+
+def tracking_size(size: tuple[int, int], longest_side: int) -> tuple[float, tuple[int, int]]:
+    """Return the scale of the tracker's frames, and their width and height."""
+    scale = tracking_scale(size, longest_side)
+    return scale, (max(16, round(size[0] * scale)), max(16, round(size[1] * scale)))
 
 
 def find_cuts(likeness: NDArray[np.float64]) -> tuple[int, ...]:
