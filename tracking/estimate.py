@@ -11,7 +11,7 @@ from pliant.tracking.appearance import Appearance
 from pliant.tracking.chaining import DELTAS, FIRST_SPACING, FIRST_STEPS, box_around
 from pliant.tracking.decoding.film import Film
 from pliant.tracking.flow import Bools, Grey, dense_flow, opencv_serial
-from pliant.tracking.region import LONG_STEP, Region, read_region
+from pliant.tracking.region import LONG_STEP, Region, read_region, resized
 from pliant.tracking.registration import Registration
 from pliant.tracking.seeding import Seeds, default_step, neighbours, place
 from pliant.tracking.survey import middle_of, tracking_size
@@ -54,11 +54,7 @@ def estimate(
         The film cannot be decoded, or the region does not fit it.
     """
     grey, scale = _frame(film if region is None else film.reaching(region_frame), region_frame, longest_side)
-    height, width = grey.shape
-    mask = np.ones((height, width), dtype=bool)
-    if region is not None:
-        drawn = read_region(region, film.size).astype(np.uint8) * 255
-        mask = np.asarray(cv2.resize(drawn, (width, height), interpolation=cv2.INTER_AREA) >= 128)
+    mask = np.ones(grey.shape, dtype=bool) if region is None else resized(read_region(region, film.size), grey.shape)
     seeds, _ = place(grey, mask, step=default_step(mask) if grid_step is None else grid_step * scale)
     start, stop, step = film.selection
     count = len(range(film.stated_frames)[start:stop:step])

@@ -81,6 +81,12 @@ def read_region(region: Region, size: tuple[int, int]) -> Bools:
     return mask
 
 
+def resized(region: Bools, shape: tuple[int, ...]) -> Bools:
+    """Scale a mask to the height and width of other pictures."""
+    levels = region.astype(np.uint8) * 255
+    return np.asarray(cv2.resize(levels, (shape[1], shape[0]), interpolation=cv2.INTER_AREA) >= INSIDE)
+
+
 def transport(
     read: Callable[[int], Grey],
     region: Bools,

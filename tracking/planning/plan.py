@@ -7,7 +7,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pliant.tracking.decoding.film import LEAST_FRAMES, Film
@@ -16,7 +15,7 @@ from pliant.tracking.flow import Bools
 from pliant.tracking.frame_store import FrameStore
 from pliant.tracking.planning.options import no_such_frame
 from pliant.tracking.records import OnStep
-from pliant.tracking.region import transport
+from pliant.tracking.region import resized, transport
 from pliant.tracking.seeding import default_step, place
 from pliant.tracking.survey import Survey, middle_of, sharpest
 
@@ -78,11 +77,10 @@ def plan_of(run: Run, found: Survey, mask: Bools | None, *, region_frame: int, t
             hint="Choose one of these, or draw the region in the shot of the template (region_frame).",
         )  # fmt: skip
     middle = sharpest(found.sharpness, start, stop)
+    shape = run.store.read(0).shape
     if mask is None or origin is None:
-        shape = run.store.read(0).shape
         return Plan(start, stop, middle if template is None else template, np.ones(shape, dtype=bool))
-    height, width = run.store.read(0).shape
-    scaled = np.asarray(cv2.resize(mask.astype(np.uint8) * 255, (width, height), interpolation=cv2.INTER_AREA) >= 128)
+    scaled = resized(mask, shape)
     lost = template is None and origin not in middle_of(start, stop)
     if lost:
         carried = _carried(run, scaled, origin, middle)
