@@ -269,7 +269,13 @@ class _Reader:
         part.size += end - start
         if part.sink is None:
             if part.size > self._rules.max_text_bytes:
-                raise _too_large(self._rules.max_text_bytes, "more", what=part.name)
+                raise wrong_input(
+                    ProblemCode.TEXT_TOO_LARGE,
+                    field=part.name,
+                    expected=f"at most {self._rules.max_text_bytes} bytes",
+                    got="more",
+                    hint="Shorten it.",
+                )
             part.text.extend(data[start:end])
             return
         piece = memoryview(data)[start:end]
@@ -308,11 +314,11 @@ def _malformed(why: str) -> Refusal:
     return Refusal(ProblemCode.MALFORMED_FORM, detail=detail)
 
 
-def _too_large(limit: int, got: str, *, what: str = "body") -> Refusal:
+def _too_large(limit: int, got: str) -> Refusal:
     return wrong_input(
-        ProblemCode.BODY_TOO_LARGE if what == "body" else ProblemCode.TEXT_TOO_LARGE,
-        field=what,
+        ProblemCode.BODY_TOO_LARGE,
+        field="body",
         expected=f"at most {limit} bytes",
         got=got,
-        hint="Send fewer frames or points, or store float32; see /v1/limits." if what == "body" else "Shorten it.",
+        hint="Send fewer frames or points, or store float32; see /v1/limits.",
     )
