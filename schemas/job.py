@@ -259,7 +259,9 @@ class Job(Record):
     trust_sentence: str | None = Field(
         default=None, description="A sentence with the expected error and the evidence for depth."
     )
-    warnings: list[str] = Field(default_factory=list, description="Warnings about this result.")
+    warnings: list[str] = Field(
+        default_factory=list, description="Warnings about this result, or about the film of a failed job."
+    )
     artifacts: list[Artifact] = Field(default_factory=list, description="Result files; empty until the job succeeds.")
     error: Problem | None = Field(default=None, description="Why the job failed; null unless it did.")
 

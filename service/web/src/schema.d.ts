@@ -517,7 +517,7 @@ export interface components {
             trust_sentence: string | null;
             /**
              * Warnings
-             * @description Warnings about this result.
+             * @description Warnings about this result, or about the film of a failed job.
              */
             warnings: string[];
             /**
