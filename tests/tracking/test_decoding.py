@@ -64,7 +64,9 @@ def test_gif_frame_durations_are_kept(tmp_path: Path) -> None:
 def test_the_rate_of_a_gif_comes_from_its_durations(tmp_path: Path) -> None:
     first, *others = [Image.fromarray(picture).quantize(64) for picture in PICTURES]
     first.save(tmp_path / "film.gif", save_all=True, append_images=others, duration=80)
-    assert open_film(tmp_path / "film.gif").fps == pytest.approx(12.5)
+    film = open_film(tmp_path / "film.gif")
+    assert film.fps == pytest.approx(12.5)
+    assert film.stated_frames == len(PICTURES), "for the estimate of its time"
     first.save(tmp_path / "single.gif")
     assert open_film(tmp_path / "single.gif").fps == PICTURE_RATE
 
