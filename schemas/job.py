@@ -160,6 +160,9 @@ class Interpretation(Record):
     )
     has_ground_truth: bool = Field(description="Whether true shapes were given, which error metrics need.")
     has_rotations: bool = Field(description="Whether cameras were given.")
+    has_region: bool = Field(
+        default=False, description="Whether the region of a film was given, as a mask picture or a polygon."
+    )
     layout: str = Field(
         description="How the track array was read, e.g. `tracks (F, P, 2)` or `W (2F, P), rows interleaved`."
     )

@@ -89,6 +89,9 @@ def test_a_film_is_checked_without_being_tracked(film: Path, region: Path) -> No
     assert film_options(Options(fps=24), facts).fps == 24
     stated = described(facts, options)
     assert stated.mesh_source == "film"
+    assert read_film(FilmSource(film, region), Options()).interpretation.has_region
+    assert read_film(FilmSource(film), Options(region_polygon=[(1, 1), (9, 1), (1, 9)])).interpretation.has_region
+    assert not read_film(FilmSource(film), Options()).interpretation.has_region
     assert "96×72 pixels" in stated.notes[0]
 
 
@@ -346,6 +349,7 @@ def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Pa
         assert tracks["tracks"][tracks["template"], :, 0].min() >= 20  # inside the region
     assert done.interpretation is not None
     assert done.interpretation.num_points == shapes_count(tmp_path / "out")
+    assert done.interpretation.has_region
     assert done.interpretation.estimate == estimated(10, done.interpretation.num_points, done.options or options)
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["seconds"]["track"] > 0
