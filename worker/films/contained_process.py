@@ -37,7 +37,7 @@ PROGRESS_EVERY = 0.2
 FOLLOWED_POINTS = 150
 """Maximum number of points shown while tracking runs: about 1.5 kB in a record that is rewritten twice a second."""
 
-SHARES = {"read": (0.0, 0.15), "locate": (0.15, 0.25), "track": (0.25, 1.0)}
+SHARES = {"read": (0.0, 0.15), "locate": (0.15, 0.25), "track": (0.25, 0.65), "fit": (0.65, 0.8), "refine": (0.8, 1.0)}
 """Start and end of each stage of the tracker, as fractions of the tracking time, from typical timings."""
 
 LOOKED = 1 / 3
@@ -217,7 +217,7 @@ def _observations(step: TrackingStep) -> list[int] | None:
     """Return the expected numbers of frames and points, None while unknown; a few points may be dropped at the end."""
     if step.followed is None or step.total is None:
         return None
-    return [(step.total + 1) // 2, len(step.followed.points)]
+    return [step.total, len(step.followed.points)]
 
 
 def _followed(step: TrackingStep, size: tuple[int, int]) -> dict[str, Any] | None:
