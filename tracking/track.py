@@ -112,7 +112,7 @@ def track_film(
     )  # fmt: skip
     opened = film if isinstance(film, Film) else open_film(film, frames=frames, limits=limits)
     check_against(
-        opened, region=region is not None, region_frame=region_frame, template_frame=template_frame, grid_step=grid_step,
+        opened, region=region, region_frame=region_frame, template_frame=template_frame, grid_step=grid_step,
         longest_side=longest_side,
     )  # fmt: skip
     stop = should_stop or (lambda: False)

@@ -26,7 +26,8 @@ from pliant.schemas.job import Progress
 from pliant.schemas.options import Options
 from pliant.service.routes.local_result import read_result
 from pliant.solver.errors import InvalidInput
-from pliant.tracking import open_film
+from pliant.tracking import FilmError, open_film
+from pliant.tracking import track_film as follow
 from pliant.tracking.advice import warnings_before
 from pliant.tracking.contact_sheet import small_jpeg
 from pliant.tracking.records import Followed, TrackingStep
@@ -158,6 +159,21 @@ def test_an_incompressible_first_frame_fits_the_answer(tmp_path: Path) -> None:
 
 
 @forked
+def test_a_mask_among_the_pictures_of_a_film_is_refused(tmp_path: Path, region: Path) -> None:
+    """It would be a frame of the film."""
+    (folder := tmp_path / "film").mkdir()
+    for number, picture in enumerate(films.textured_pictures(4, SIZE)):
+        Image.fromarray(picture).save(folder / f"{number}.png")
+    mask = folder / "mask.png"
+    mask.write_bytes(region.read_bytes())
+    wrong = refusal(FilmSource(folder, mask))
+    assert (wrong.code, wrong.got) == ("wrong_region", "mask.png in it, which would be a frame of the film")
+    with pytest.raises(FilmError, match="expected a mask outside the film's folder of pictures"):
+        follow(folder, region=mask)
+    mask.rename(tmp_path / "mask.png")
+    assert read_film(FilmSource(folder, tmp_path / "mask.png"), Options()).facts.frames == 4
+
+
 def test_film_limits_come_from_the_settings(film: Path) -> None:
     settings = Settings(film_frames=8, film_pixels=5000, film_seconds=2)
     bounds = FilmBounds.of(settings, max_bytes=10**6)

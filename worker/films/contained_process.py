@@ -117,7 +117,7 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
     if region is not None:
         read_region(region, film.size)
     check_against(
-        film, region=region is not None, region_frame=options["region_frame"], template_frame=options["template_frame"],
+        film, region=region, region_frame=options["region_frame"], template_frame=options["template_frame"],
         grid_step=options["grid_step"], longest_side=options["longest_side"],
     )  # fmt: skip
     facts: dict[str, Any] = {
