@@ -108,8 +108,10 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
         )  # fmt: skip
     with closing(film.frames()) as frames:
         first = next(frames, None)
-        if first is None or (count is not None and count < LEAST_FRAMES):
-            raise film.too_few_frames(count or 0)
+        if first is None:  # the file states more frames than it has
+            raise film.too_few_frames(0)
+        if count is not None and count < LEAST_FRAMES:
+            raise film.too_few_frames(count)
         for frame in frames:  # raises an error if all are equal, as those of an interlaced film are
             if not np.array_equal(frame.image, first.image) or time.process_time() > LOOKED * bounds.check_seconds:
                 break
