@@ -174,13 +174,11 @@ def test_a_mask_among_the_pictures_of_a_film_is_refused(tmp_path: Path, region: 
     assert read_film(FilmSource(folder, tmp_path / "mask.png"), Options()).facts.frames == 4
 
 
-def test_a_selection_after_the_end_of_a_trimmed_film_has_no_frames(tmp_path: Path) -> None:
-    film = films.write_film(tmp_path / "film.mp4", films.textured_pictures(20, SIZE))
-    movie = film.read_bytes().index(b"mvhd") + 4
-    scale = int.from_bytes(film.read_bytes()[movie + 12 : movie + 16])
-    films.patched(film, b"elst", 12, struct.pack(">I", scale // 3))  # an edit list that ends after a third of a second
-    assert (open_film(film).stated_frames, sum(1 for _ in open_film(film).frames())) == (20, 10)
-    wrong = refusal(FilmSource(film), Options(frames="12:18"))
+def test_a_selection_after_the_end_of_a_damaged_film_has_no_frames(tmp_path: Path) -> None:
+    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(20, SIZE))
+    film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
+    assert (open_film(film).stated_frames, sum(1 for _ in open_film(film).frames()) < 15) == (20, True)
+    wrong = refusal(FilmSource(film), Options(frames="16:20"))
     assert (wrong.code, wrong.got) == ("too_few_frames", "0")
 
 

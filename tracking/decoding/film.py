@@ -15,7 +15,7 @@ from typing import TypedDict
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pliant.tracking.decoding.containers import Container, openable, recognise
+from pliant.tracking.decoding.containers import Container, edited_seconds, openable, recognise
 from pliant.tracking.decoding.limits import FilmLimits
 from pliant.tracking.decoding.pictures import (
     checked,
@@ -84,7 +84,7 @@ class Film:
     """Frames per second according to the file or, if it states none, the times of its first frames; 30 for pictures."""
 
     stated_frames: int
-    """Number of frames according to the file, which may be wrong; 0 if it gives none."""
+    """Number of frames according to the file, without those that its edit list leaves out, which may be wrong; 0 if it gives none."""
 
     rotation: int
     """Clockwise rotation, degrees, that turns the stored frames upright: 0, 90, 180 or 270."""
@@ -259,6 +259,8 @@ def _facts(path: Path, container: Container, limits: FilmLimits) -> _Facts:
             timed = _rate(_first_times(capture))
             if not abs(rate - timed) <= SAME_RATE * timed:
                 rate, stated = timed, 0  # the number of frames was computed from the rate
+        shown = edited_seconds(path) if container == "mp4" else None
+        stated = stated if shown is None else min(stated, round(shown * rate))
     finally:
         capture.release()
     return _Facts(
