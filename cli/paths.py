@@ -65,13 +65,13 @@ def tracks_or_film(path: Path) -> None:
         The path is missing, not readable, or a folder without pictures.
     """
     from pliant.client.errors import BadArgument
-    from pliant.schemas.pictures import pictures_in
+    from pliant.schemas.pictures import SUFFIXES, pictures_in
 
     if not path.is_dir():
         input_file(path, "tracks")
     elif not pictures_in(path):
         raise BadArgument(
-            f"tracks: expected a file or a folder of pictures, got the folder {path}, which has no pictures. "
+            f"tracks: expected a file or a folder of pictures ({', '.join(SUFFIXES)}), got the folder {path}, which has none. "
             "Give the path of a file in it."
         )
 

@@ -90,6 +90,7 @@ def show_fault(fault: BaseException, sentence: str, code: Exit, *, as_json: bool
         err().print_json(json.dumps(document if more is None else {**document, "explained_at": more}))
         return
     screen = err()
+    show_warnings(getattr(getattr(fault, "job", None), "warnings", ()), screen)  # of a job that failed
     screen.print(Text.assemble(("error ", "bold red"), sentence))
     for choice in details.get("choices", ()):
         options = " ".join(f"-O {name}={value}" for name, value in choice.get("options", {}).items())

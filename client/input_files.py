@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pliant.client.errors import BadArgument
 from pliant.schemas.job import LONGEST_NAME
-from pliant.schemas.pictures import SUFFIXES, pictures_in
+from pliant.schemas.pictures import SUFFIXES, is_frame, pictures_in
 
 Source = ArrayLike | Mapping[str, Any] | Path | str
 """An array, a dictionary of arrays as a tracker returns it, or the path of a file."""
@@ -113,16 +113,22 @@ def mesh_text(mesh: str) -> str | None:
     return word if re.fullmatch(r"none|[0-9]{1,6}x[0-9]{1,6}", word) is not None else None
 
 
-def region_part(region: Region, folder: Path) -> Path:
+def region_part(region: Region, folder: Path, *, film: Path | str | None = None) -> Path:
     """Return the picture of a film's region; an array is written as PNG.
 
     Raises
     ------
     BadArgument
-        The region is neither such an array nor a file.
+        The region is neither such an array nor a file, or it is a file among the pictures of the film.
     """
     if isinstance(region, str | Path):
-        return existing_file(region, "region")
+        file = existing_file(region, "region")
+        if film is not None and is_frame(file, expanded(film, "film")):
+            raise BadArgument(
+                f"region: expected a mask outside the film's folder of pictures, got {file.name} in it, which would be a frame of the "
+                "film. Move the mask to another folder."
+            )
+        return file
     mask = _array(region, "region")
     if mask.ndim != 2 or mask.size == 0 or mask.dtype not in (np.dtype(bool), np.dtype(np.uint8)):
         raise BadArgument(

@@ -157,7 +157,7 @@ class Inputs:
         elif self.tracks is not None:
             files = {"tracks": tracks_file(self.tracks, self.visible, folder)}
         if self.region is not None:
-            files["region"] = region_part(self.region, folder)
+            files["region"] = region_part(self.region, folder, film=self.film)
         if self.mesh is not None:
             part = mesh_part(self.mesh, folder)
             if isinstance(part, str):

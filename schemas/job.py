@@ -160,6 +160,9 @@ class Interpretation(Record):
     )
     has_ground_truth: bool = Field(description="Whether true shapes were given, which error metrics need.")
     has_rotations: bool = Field(description="Whether cameras were given.")
+    has_region: bool = Field(
+        default=False, description="Whether the region of a film was given, as a mask picture or a polygon."
+    )
     layout: str = Field(
         description="How the track array was read, e.g. `tracks (F, P, 2)` or `W (2F, P), rows interleaved`."
     )
@@ -259,7 +262,9 @@ class Job(Record):
     trust_sentence: str | None = Field(
         default=None, description="A sentence with the expected error and the evidence for depth."
     )
-    warnings: list[str] = Field(default_factory=list, description="Warnings about this result.")
+    warnings: list[str] = Field(
+        default_factory=list, description="Warnings about this result, or about the film of a failed job."
+    )
     artifacts: list[Artifact] = Field(default_factory=list, description="Result files; empty until the job succeeds.")
     error: Problem | None = Field(default=None, description="Why the job failed; null unless it did.")
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.tracking.contact_sheet import View, draw_contact_sheet
 
-Stage = Literal["read", "locate", "track"]
+Stage = Literal["read", "locate", "track", "fit", "refine"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,17 +36,17 @@ class TrackingStep:
     """Progress of one stage."""
 
     stage: Stage
-    """"read": decode the film; "locate": find the region in the template; "track": follow the points, then follow them again from positions
-    predicted from all frames."""
+    """"read": decode the film; "locate": find the region in the template; "track": follow the points; "fit": fit their paths to all frames;
+    "refine": follow them again from there."""
 
     done: int
-    """Completed frames of this stage; in "track", frames of the second pass count as well."""
+    """Completed frames of this stage; steps in "fit"."""
 
     total: int | None
-    """Frames of this stage; None while the film's length is unknown."""
+    """Frames of this stage, steps in "fit"; None while the film's length is unknown."""
 
     followed: Followed | None = field(default=None, compare=False)
-    """Points in the frame just completed; only in "track"."""
+    """Points in the frame just completed; only in "track" and "refine"."""
 
 
 OnStep = Callable[[TrackingStep], None]

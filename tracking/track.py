@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from pliant.solver.threads import available_cores, serial_blas
 from pliant.tracking.advice import warnings_before, warnings_of, warnings_unread
 from pliant.tracking.appearance import Appearance
-from pliant.tracking.chaining import FIRST_SPACING, Chain, chain
+from pliant.tracking.chaining import FIRST_SPACING, Chain, OnFrame, chain
 from pliant.tracking.contact_sheet import View, view_of
 from pliant.tracking.decoding.film import RATES, Film, open_film
 from pliant.tracking.decoding.limits import FilmLimits
@@ -21,7 +22,7 @@ from pliant.tracking.flow import Bools, Floats, Grey, opencv_serial
 from pliant.tracking.frame_store import FrameStore
 from pliant.tracking.planning.options import check_against, check_numbers
 from pliant.tracking.planning.plan import Plan, Run, plan_of
-from pliant.tracking.records import FilmInfo, Followed, OnStep, TrackedFilm, TrackingStep
+from pliant.tracking.records import FilmInfo, Followed, OnStep, Stage, TrackedFilm, TrackingStep
 from pliant.tracking.region import Region, read_region
 from pliant.tracking.registration import Registration
 from pliant.tracking.seeding import Seeds, default_step, keep, neighbours, place, quads
@@ -111,7 +112,7 @@ def track_film(
     )  # fmt: skip
     opened = film if isinstance(film, Film) else open_film(film, frames=frames, limits=limits)
     check_against(
-        opened, region=region is not None, region_frame=region_frame, template_frame=template_frame, grid_step=grid_step,
+        opened, region=region, region_frame=region_frame, template_frame=template_frame, grid_step=grid_step,
         longest_side=longest_side,
     )  # fmt: skip
     stop = should_stop or (lambda: False)
@@ -145,25 +146,28 @@ def _track(run: Run, found: Survey, plan: Plan, step: float | None, *, whole: bo
     fine = Registration.of(template, seeds.points, seeds.grid, noise=appearance.noise)
     rough = fine.coarse(template, FIRST_SPACING)
     length = plan.stop - plan.start
-    done = 1
 
-    def on_frame(t: int, points: Floats, visible: Bools) -> None:
-        nonlocal done
-        done += 1
-        row = plan.start + t
-        followed = Followed(int(found.indices[row]), float(found.times[row]), _in_film(points, found.scale), visible)
-        run.on_step(TrackingStep("track", done, 2 * length - 1, followed))
+    def reporter(stage: Stage) -> OnFrame:
+        done = itertools.count(2)  # the template is known
+
+        def on_frame(t: int, points: Floats, visible: Bools) -> None:
+            row = plan.start + t
+            shown = Followed(int(found.indices[row]), float(found.times[row]), _in_film(points, found.scale), visible)
+            run.on_step(TrackingStep(stage, next(done), length, shown))
+
+        return on_frame
 
     def read(t: int) -> Grey:
         return run.store.read(plan.start + t)
 
     chained = chain(
         read, length, plan.template - plan.start, appearance, rough,
-        pool=run.pool, on_frame=on_frame, should_stop=run.should_stop,
+        pool=run.pool, on_frame=reporter("track"), should_stop=run.should_stop,
     )  # fmt: skip
     track_again(
         read, chained, plan.template - plan.start, appearance, rough, fine,
-        pool=run.pool, on_frame=on_frame, should_stop=run.should_stop,
+        pool=run.pool, on_frame=reporter("refine"), should_stop=run.should_stop,
+        on_part=lambda done, total: run.on_step(TrackingStep("fit", done, total)),
     )  # fmt: skip
     kept_grid, kept = keep(seeds.grid, chained.visible.mean(axis=0) >= LEAST_SEEN)
     if len(kept) < LEAST_POINTS:

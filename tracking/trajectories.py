@@ -16,7 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 from pliant.solver import Tracks
 from pliant.solver.records import MIN_POINTS
-from pliant.solver.tracks.completion import choose_points, coefficients_of, fit_basis, predict
+from pliant.solver.tracks.completion import RANKS, choose_points, coefficients_of, fit_basis, predict
 from pliant.solver.tracks.normalization import normalize
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.chaining import FIRST_STEPS, Chain, OnFrame, Read
@@ -31,6 +31,10 @@ FRAMES_AHEAD = 8
 """Frames whose registration is queued or running: two for each of the default's four threads at most."""
 
 
+OnPart = Callable[[int, int], None]
+"""Called with the number of completed parts, and with the number of all, which may turn out to be fewer."""
+
+
 def move_to_expected(chained: Chain, should_stop: Callable[[], bool]) -> None:
     """Move all points to their paths in a low-dimensional space, fitted to their positions weighted by confidence.
 
@@ -41,7 +45,8 @@ def move_to_expected(chained: Chain, should_stop: Callable[[], bool]) -> None:
     FilmError
         Code tracks_lost: too few points are visible in more than the template.
     TrackingStopped
-        `should_stop` returned True; some points may have been moved.
+        `should_stop`, which is called after every dimension tried and before every part of the points, returned True; some points may
+        have been moved.
     """
     weight, random = chained.confidence, np.random.default_rng(0)
     chosen = choose_points(weight, random)
@@ -74,18 +79,27 @@ def track_again(
     pool: ThreadPoolExecutor,
     on_frame: OnFrame,
     should_stop: Callable[[], bool],
+    on_part: OnPart | None = None,
 ) -> None:
     """Register every frame again from the predicted positions; points that match the template there become visible again.
 
     Lost points are tried twice: where their paths predict them and, because paths of points that are often lost are inaccurate, where they
     go along with the others in a rough registration. `chained` is the result of `chain`; its arrays are overwritten.
+    `on_part` is called while the paths are fitted, `on_frame` as by `chain`.
 
     Raises
     ------
     FilmError, TrackingStopped
         See `move_to_expected`.
     """
-    move_to_expected(chained, should_stop)
+    done, parts = itertools.count(1), len(RANKS) + len(range(0, chained.points.shape[1], POINTS_AT_ONCE))
+
+    def stopped_at_part() -> bool:
+        if on_part is not None and not should_stop():
+            on_part(next(done), parts)
+        return should_stop()
+
+    move_to_expected(chained, stopped_at_part)
     chained.points[template] = appearance.points
 
     def again(t: int) -> tuple[Floats, Bools, Floats]:

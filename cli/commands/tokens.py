@@ -121,15 +121,17 @@ def table_of(tokens: Sequence[Token]) -> Table:
     from rich.table import Column, Table
 
     now, longest = datetime.now(UTC), max((len(token.id) for token in tokens), default=0)
+    limits = [limits_of(token) for token in tokens]
     table = Table(
         Column("id", no_wrap=True, min_width=longest),
         "name",
         "scopes",
-        "created",
-        "expires",
+        Column("created", overflow="fold"),
+        Column("expires", overflow="fold"),
         Column("jobs of", no_wrap=True),
+        *(["limits"] if any(limits) else []),
     )
-    for token in tokens:
+    for token, own in zip(tokens, limits, strict=True):
         expires = "never" if token.expires_at is None else f"{token.expires_at:%Y-%m-%d %H:%M}"
         table.add_row(
             token.id,
@@ -138,8 +140,20 @@ def table_of(tokens: Sequence[Token]) -> Table:
             f"{token.created_at:%Y-%m-%d %H:%M}",
             f"{expires} (expired)" if token.expired(now) else expires,
             "all" if token.sees_all else token.owner,
+            *([own] if any(limits) else []),
         )
     return table
+
+
+def limits_of(token: Token) -> str:
+    """Return the limits that a token has instead of the service's; empty if none."""
+    each = {
+        "{} queued": token.max_queued,
+        "{} running": token.max_running,
+        "{:g} MB a body": None if token.max_body_bytes is None else token.max_body_bytes / MB,
+        "{} requests a minute": token.requests_per_minute,
+    }
+    return ", ".join(words.format(most) for words, most in each.items() if most is not None)
 
 
 @app.command()

@@ -15,6 +15,7 @@ from pliant.solver.isometry.inextensible import Indices
 from pliant.solver.isometry.placement import TemplateMap, places_of
 from pliant.solver.isometry.splines import spline
 from pliant.solver.model.so3 import nearest
+from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats
 from pliant.solver.tracks.noise import RAYLEIGH_MEDIAN
 from scipy import sparse
@@ -68,9 +69,12 @@ def complete_anchors(points: Floats, seen: NDArray[np.bool_], template: Floats) 
     from the nearest frame that shows enough.
     """
     filled, enough = points.copy(), np.ones(len(points), dtype=bool)
+    shown = np.where(seen[..., None], points, 0.0)
+    by_anchor, squares = shown.transpose(1, 0, 2).reshape(seen.shape[1], -1), np.square(shown).sum(axis=2)
     for frame in np.flatnonzero(~seen.all(axis=1)):
+        pulse()
         missing = ~seen[frame]
-        for other in _alike(points, seen, int(frame)):
+        for other in _alike(by_anchor, squares, seen, int(frame)):
             both, gained = seen[frame] & seen[other], missing & seen[other]
             if gained.any() and _enough(template, both):
                 moved = _moved(points[other], points[frame], both)
@@ -161,15 +165,24 @@ def _enough(template: Floats, shown: NDArray[np.bool_]) -> bool:
     )
 
 
-def _alike(points: Floats, seen: NDArray[np.bool_], frame: int) -> Indices:
-    """Return the frames that share `MIN_ANCHORS` anchors with a frame, sorted by their distance after a rigid motion."""
-    distance = np.full(len(points), np.inf)
-    for other in range(len(points)):
-        both = seen[frame] & seen[other]
-        if other != frame and both.sum() >= MIN_ANCHORS:
-            moved = _moved(points[other], points[frame], both)
-            distance[other] = np.square(moved - points[frame])[both].mean()
-    return np.argsort(distance, kind="stable")[: int(np.isfinite(distance).sum())]
+def _alike(by_anchor: Floats, squares: Floats, seen: NDArray[np.bool_], frame: int) -> Indices:
+    """Return the frames that share `MIN_ANCHORS` anchors with a frame, sorted by their distance after a rigid motion.
+
+    `by_anchor` are the positions `(A, 3F)` and `squares` their squared lengths `(F, A)`, 0 where hidden. The distance follows from the
+    singular values of the covariance (Kabsch 1976).
+    """
+    used, own = seen[frame].astype(np.float64), by_anchor[:, 3 * frame : 3 * frame + 3]
+    count = seen @ used
+    shared = np.maximum(count, 1.0)
+    here, there = (used @ by_anchor).reshape(-1, 3), seen @ own  # sums over the common anchors
+    products = (own.T @ by_anchor).reshape(3, -1, 3).transpose(1, 0, 2)
+    covariance = products - there[:, :, None] * here[:, None] / shared[:, None, None]
+    spread = squares @ used + seen @ squares[frame] - (np.square(here) + np.square(there)).sum(axis=1) / shared
+    along = np.linalg.svd(covariance, compute_uv=False)
+    along[:, 2] *= np.sign(np.linalg.det(covariance))
+    distance = (spread - 2 * along.sum(axis=1)) / shared
+    usable = np.flatnonzero((count >= MIN_ANCHORS) & (np.arange(len(seen)) != frame))
+    return usable[np.argsort(distance[usable], kind="stable")]
 
 
 def _moved(source: Floats, target: Floats, used: NDArray[np.bool_]) -> Floats:

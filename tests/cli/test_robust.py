@@ -86,7 +86,7 @@ NO_TRACKS = (
     "FOLDER: expected track files (.csv, .h5, .hdf5, .mat, .npy, .npz, .txt), got an empty folder. Name the files."
 )
 NO_PICTURES = (
-    "tracks: expected a file or a folder of pictures, got the folder FOLDER, which has no pictures. "
+    "tracks: expected a file or a folder of pictures (.png, .jpg, .jpeg, .webp, .bmp), got the folder FOLDER, which has none. "
     "Give the path of a file in it."
 )
 A_FILE = "--output: expected a folder, got the file TRACKS. Choose another folder."

@@ -11,9 +11,11 @@ from pathlib import Path
 import pytest
 from pliant.cli.commands.batch import Batch, Row
 from pliant.cli.demo import MEANINGS, report
+from pliant.cli.exits import Exit
 from pliant.cli.session import Session
-from pliant.cli.show import METRIC_MEANINGS, metrics_table, print_json, show_job, show_jobs, verdict_lines
+from pliant.cli.show import METRIC_MEANINGS, metrics_table, print_json, show_fault, show_job, show_jobs, verdict_lines
 from pliant.cli.solve import show_finished
+from pliant.client.errors import JobFailed
 from pliant.schemas.job import Interpretation, Job, Progress, Status
 from pliant.schemas.options import Options
 from pliant.worker.jobs.finished import Finished
@@ -71,6 +73,21 @@ def test_solve_states_the_camera(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.splitlines()[-3:] == [lens, *LAST]
     show_finished(finished(camera_sentence=lens), Path("out"), as_json=True)
     assert json.loads(capsys.readouterr().out)["camera_sentence"] == lens
+
+
+def test_a_failed_job_is_shown_with_the_warnings_about_its_film(capsys: pytest.CaptureFixture[str]) -> None:
+    cut = "The film has a cut (at frame 10)."
+    error = {
+        "code": "tracks_lost",
+        "status": 422,
+        "title": "Lost",
+        "detail": "No points.",
+        "type": "/errors/tracks_lost",
+    }
+    fault = JobFailed(job(status=Status.FAILED, error=error, warnings=[cut]))
+    show_fault(fault, str(fault), Exit.FAILED, as_json=False)
+    warned, failed, _ = capsys.readouterr().err.splitlines()
+    assert (warned, failed) == (f"warning {cut}", f"error {fault}")
 
 
 def test_shown_jobs_end_with_the_verdict_and_old_ones_with_the_outcome(capsys: pytest.CaptureFixture[str]) -> None:

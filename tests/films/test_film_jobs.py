@@ -26,7 +26,8 @@ from pliant.schemas.job import Progress
 from pliant.schemas.options import Options
 from pliant.service.routes.local_result import read_result
 from pliant.solver.errors import InvalidInput
-from pliant.tracking import open_film
+from pliant.tracking import FilmError, open_film
+from pliant.tracking import track_film as follow
 from pliant.tracking.advice import warnings_before
 from pliant.tracking.contact_sheet import small_jpeg
 from pliant.tracking.records import Followed, TrackingStep
@@ -89,6 +90,9 @@ def test_a_film_is_checked_without_being_tracked(film: Path, region: Path) -> No
     assert film_options(Options(fps=24), facts).fps == 24
     stated = described(facts, options)
     assert stated.mesh_source == "film"
+    assert read_film(FilmSource(film, region), Options()).interpretation.has_region
+    assert read_film(FilmSource(film), Options(region_polygon=[(1, 1), (9, 1), (1, 9)])).interpretation.has_region
+    assert not read_film(FilmSource(film), Options()).interpretation.has_region
     assert "96×72 pixels" in stated.notes[0]
 
 
@@ -155,6 +159,29 @@ def test_an_incompressible_first_frame_fits_the_answer(tmp_path: Path) -> None:
 
 
 @forked
+def test_a_mask_among_the_pictures_of_a_film_is_refused(tmp_path: Path, region: Path) -> None:
+    """It would be a frame of the film."""
+    (folder := tmp_path / "film").mkdir()
+    for number, picture in enumerate(films.textured_pictures(4, SIZE)):
+        Image.fromarray(picture).save(folder / f"{number}.png")
+    mask = folder / "mask.png"
+    mask.write_bytes(region.read_bytes())
+    wrong = refusal(FilmSource(folder, mask))
+    assert (wrong.code, wrong.got) == ("wrong_region", "mask.png in it, which would be a frame of the film")
+    with pytest.raises(FilmError, match="expected a mask outside the film's folder of pictures"):
+        follow(folder, region=mask)
+    mask.rename(tmp_path / "mask.png")
+    assert read_film(FilmSource(folder, tmp_path / "mask.png"), Options()).facts.frames == 4
+
+
+def test_a_selection_after_the_end_of_a_damaged_film_has_no_frames(tmp_path: Path) -> None:
+    film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(20, SIZE))
+    film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
+    assert (open_film(film).stated_frames, sum(1 for _ in open_film(film).frames()) < 15) == (20, True)
+    wrong = refusal(FilmSource(film), Options(frames="16:20"))
+    assert (wrong.code, wrong.got) == ("too_few_frames", "0")
+
+
 def test_film_limits_come_from_the_settings(film: Path) -> None:
     settings = Settings(film_frames=8, film_pixels=5000, film_seconds=2)
     bounds = FilmBounds.of(settings, max_bytes=10**6)
@@ -346,6 +373,7 @@ def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Pa
         assert tracks["tracks"][tracks["template"], :, 0].min() >= 20  # inside the region
     assert done.interpretation is not None
     assert done.interpretation.num_points == shapes_count(tmp_path / "out")
+    assert done.interpretation.has_region
     assert done.interpretation.estimate == estimated(10, done.interpretation.num_points, done.options or options)
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["seconds"]["track"] > 0

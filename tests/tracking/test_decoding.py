@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from pliant.tracking import Film, FilmError, FilmLimits, open_film
+from pliant.tracking.decoding.containers import edited_seconds
 from pliant.tracking.decoding.film import PICTURE_RATE
 from pliant.tracking.decoding.pictures import readable
 
@@ -61,10 +62,39 @@ def test_gif_frame_durations_are_kept(tmp_path: Path) -> None:
     assert [frame.index for frame in open_film(tmp_path / "film.gif", frames=3).frames()] == [0, 3, 6]
 
 
+def test_frames_that_an_edit_list_leaves_out_are_not_counted(tmp_path: Path) -> None:
+    """As in a film that was cut without being encoded again."""
+    path = films.write_film(tmp_path / "film.mp4", films.textured_pictures(30, (64, 48)))
+    assert edited_seconds(path) == pytest.approx(30 / open_film(path).fps)
+    content = path.read_bytes()
+    scale = int.from_bytes(content[content.index(b"mvhd") + 16 :][:4])
+    films.patched(path, b"elst", 12, struct.pack(">I", scale * 12 // 30))
+    film = open_film(path)
+    assert film.stated_frames == len(list(film.frames())) == 12
+
+
+def test_edit_lists_may_have_times_of_64_bits_and_sound_has_its_own(tmp_path: Path) -> None:
+    def track(media: bytes, length: int) -> bytes:
+        edits = films.box(b"elst", b"\1", bytes(3), struct.pack(">IQqI", 1, length, 0, 1 << 16))
+        handler = films.box(b"hdlr", bytes(8), media, bytes(13))
+        data = films.box(b"hdlr", bytes(4), b"dhlralis", bytes(13))
+        return films.box(b"trak", films.box(b"edts", edits), films.box(b"mdia", handler, films.box(b"minf", data)))
+
+    movie = films.box(b"mvhd", b"\1", bytes(19), struct.pack(">I", 600), bytes(88))
+    for tracks in ((b"vide", b"soun"), (b"soun", b"vide")):
+        boxes = [track(media, {b"vide": 900, b"soun": 60}[media]) for media in tracks]
+        (tmp_path / "film.mov").write_bytes(films.box(b"moov", movie, *boxes))
+        assert edited_seconds(tmp_path / "film.mov") == 1.5
+    (tmp_path / "film.mov").write_bytes(films.box(b"moov", movie))
+    assert edited_seconds(tmp_path / "film.mov") is None
+
+
 def test_the_rate_of_a_gif_comes_from_its_durations(tmp_path: Path) -> None:
     first, *others = [Image.fromarray(picture).quantize(64) for picture in PICTURES]
     first.save(tmp_path / "film.gif", save_all=True, append_images=others, duration=80)
-    assert open_film(tmp_path / "film.gif").fps == pytest.approx(12.5)
+    film = open_film(tmp_path / "film.gif")
+    assert film.fps == pytest.approx(12.5)
+    assert film.stated_frames == len(PICTURES), "for the estimate of its time"
     first.save(tmp_path / "single.gif")
     assert open_film(tmp_path / "single.gif").fps == PICTURE_RATE
 

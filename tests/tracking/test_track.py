@@ -166,8 +166,13 @@ def test_a_region_is_transferred_to_another_template_frame(turning: tuple[Path, 
     assert film.region(9)[row, column].mean() > 0.95
     covered = cv2.dilate(_mask(tracked, 9, (72, 96)), np.ones((5, 5), np.uint8)) > 0
     assert (covered & film.region(9)).sum() > 0.65 * film.region(9).sum()
-    assert {step.stage for step in steps} == {"read", "locate", "track"}
-    assert [step.done for step in steps if step.stage == "track"] == list(range(2, 2 * FRAMES))
+    assert list(dict.fromkeys(step.stage for step in steps)) == ["read", "locate", "track", "fit", "refine"]
+    for stage in ("track", "refine"):
+        assert [step.done for step in steps if step.stage == stage] == list(range(2, FRAMES + 1))
+    assert all(step.total == FRAMES for step in steps if step.stage in ("track", "refine"))
+    fitted = [(step.done, step.total) for step in steps if step.stage == "fit"]
+    assert [done for done, _ in fitted] == list(range(1, len(fitted) + 1))
+    assert len(fitted) <= fitted[-1][1]  # type: ignore[operator]
     assert steps[0] == TrackingStep("read", 1, None)
 
 
@@ -178,7 +183,7 @@ def _mask(tracked: TrackedFilm, frame: int, shape: tuple[int, int]) -> np.ndarra
     return mask
 
 
-@pytest.mark.parametrize("stage", ["read", "locate", "track"])
+@pytest.mark.parametrize("stage", ["read", "locate", "track", "fit", "refine"])
 def test_tracking_stops_at_every_stage(turning: tuple[Path, RenderedFilm], stage: str) -> None:
     path, film = turning
     reached = threading.Event()

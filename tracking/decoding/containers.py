@@ -26,7 +26,7 @@ MAX_STREAMS = 16
 """Maximum number of streams in one film; a camera writes two to five (picture, sound, metadata)."""
 
 MP4_BOXES = {b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot"}
-NESTED = {b"moov", b"trak", b"mdia", b"minf", b"dinf"}
+NESTED = {b"moov", b"trak", b"edts", b"mdia", b"minf", b"dinf"}
 ARRAYS = (b"\x93NUMPY", b"\x89HDF", b"MATLAB 5.0")
 """First bytes of npy, HDF5 (MATLAB 7.3, SLEAP, DeepLabCut) and MATLAB 5 files, which hold tracks."""
 PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*")
@@ -37,7 +37,7 @@ PHOTOS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"avif")
 """Brands of single pictures in the boxes of an MP4 file (ISO/IEC 23008-12, and AVIF)."""
 MATRICES = {b"tkhd": 40, b"mvhd": 36}
 """Boxes with a display matrix, and its place in their content, bytes; 12 bytes later in version 1."""
-READ = {b"hdlr", b"dref", *MATRICES}
+READ = {b"hdlr", b"dref", b"elst", *MATRICES}
 """Boxes whose content is read."""
 TEXTS = (b"#EXT", b"ffconcat", b"v=0", b"<?xml", b"<MPD", b"[playlist]", b"http", b"rtsp", b"file:")
 
@@ -188,6 +188,26 @@ def _check_mp4(stream: BinaryIO, name: str) -> None:
         )  # fmt: skip
     if b"hdlr:vide" not in kinds:
         raise _refusal("no_picture", f"{name}, which holds sound but no picture", "Pass a film with a picture track.")
+
+
+def edited_seconds(path: Path) -> float | None:
+    """Return the length of the edit list of an MP4 or QuickTime film's picture; None without such a list.
+
+    A film that was cut without being encoded again contains frames that its edit list leaves out (ISO/IEC 14496-12, 8.6.6).
+    """
+    scale, track, seconds = 0, b"", 0.0
+    with openable(path), path.open("rb") as stream:
+        for kind, body in _boxes(stream, os.fstat(stream.fileno()).st_size):
+            wide = body[:1] == b"\1"
+            if kind == b"mvhd":
+                scale = int.from_bytes(body[20:24] if wide else body[12:16])
+            if kind == b"hdlr" and body[4:8] != b"dhlr":  # which describes where QuickTime's data lies
+                track = body[8:12]
+            if kind == b"elst" and track == b"vide" and scale > 0:
+                entry = struct.Struct(">Q12x" if wide else ">I8x")
+                whole = len(body[8:]) // entry.size * entry.size
+                seconds = sum(length for (length,) in entry.iter_unpack(body[8 : 8 + whole])) / scale
+    return seconds or None
 
 
 def _boxes(stream: BinaryIO, end: int) -> Iterator[tuple[bytes, bytes]]:

@@ -15,9 +15,16 @@ from typing import TypedDict
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pliant.tracking.decoding.containers import Container, openable, recognise
+from pliant.tracking.decoding.containers import Container, edited_seconds, openable, recognise
 from pliant.tracking.decoding.limits import FilmLimits
-from pliant.tracking.decoding.pictures import checked, folder_pictures, gif_frames, read_picture, zip_pictures
+from pliant.tracking.decoding.pictures import (
+    checked,
+    folder_pictures,
+    gif_frames,
+    gif_length,
+    read_picture,
+    zip_pictures,
+)
 from pliant.tracking.errors import FilmError
 
 PICTURE_RATE = 30.0
@@ -77,7 +84,7 @@ class Film:
     """Frames per second according to the file or, if it states none, the times of its first frames; 30 for pictures."""
 
     stated_frames: int
-    """Number of frames according to the file, which may be wrong; 0 if it gives none."""
+    """Number of frames according to the file, without those that its edit list leaves out, which may be wrong; 0 if it gives none."""
 
     rotation: int
     """Clockwise rotation, degrees, that turns the stored frames upright: 0, 90, 180 or 270."""
@@ -232,7 +239,7 @@ def _facts(path: Path, container: Container, limits: FilmLimits) -> _Facts:
     if container == "gif":
         first = [(time, image.shape) for time, image in itertools.islice(gif_frames(path, limits), TIMED_FRAMES)]
         height, width = first[0][1][:2]
-        return _pictures((width, height), 0, _rate([time for time, _ in first]))
+        return _pictures((width, height), gif_length(path), _rate([time for time, _ in first]))
     if container in ("zip", "folder"):
         with (zip_pictures if container == "zip" else folder_pictures)(path, limits) as listed:
             name, read = listed[0]
@@ -252,6 +259,8 @@ def _facts(path: Path, container: Container, limits: FilmLimits) -> _Facts:
             timed = _rate(_first_times(capture))
             if not abs(rate - timed) <= SAME_RATE * timed:
                 rate, stated = timed, 0  # the number of frames was computed from the rate
+        shown = edited_seconds(path) if container == "mp4" else None
+        stated = stated if shown is None else min(stated, round(shown * rate))
     finally:
         capture.release()
     return _Facts(
@@ -322,10 +331,8 @@ def _selection(film: Film, frames: int | slice | str | None) -> tuple[int, int |
 
 def _count(film: Film) -> int:
     """Count the frames by reading the film, because headers are often wrong."""
-    if film.container in ("zip", "folder"):
+    if film.container in ("zip", "folder", "gif"):
         return film.stated_frames
-    if film.container == "gif":
-        return sum(1 for _ in gif_frames(film.path, film.limits))
     capture = _open_capture(film.path)
     try:
         count = 0

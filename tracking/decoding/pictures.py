@@ -119,6 +119,12 @@ def gif_frames(path: Path, limits: FilmLimits) -> Iterator[tuple[float, Colour]]
             index += 1
 
 
+def gif_length(path: Path) -> int:
+    """Return the number of frames of a GIF, whose header states none, without decoding them."""
+    with readable(path.name), Image.open(path, formats=("GIF",)) as film:
+        return int(film.n_frames)  # type: ignore[attr-defined]
+
+
 @contextmanager
 def folder_pictures(path: Path, limits: FilmLimits) -> Iterator[Listed]:
     """List the pictures of a folder in natural order.

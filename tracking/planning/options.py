@@ -5,11 +5,16 @@ from __future__ import annotations
 import math
 import operator
 from numbers import Integral, Real
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from pliant.schemas.pictures import is_frame
 from pliant.tracking.decoding.film import Film
 from pliant.tracking.errors import FilmError
 from pliant.tracking.survey import BROKEN_SHARE, tracking_scale
+
+if TYPE_CHECKING:
+    from pliant.tracking.region import Region
 
 
 def check_numbers(
@@ -39,19 +44,19 @@ def check_numbers(
 def check_against(
     film: Film,
     *,
-    region: bool,
+    region: Region | None,
     region_frame: int,
     template_frame: int | None,
     grid_step: float | None,
     longest_side: int,
 ) -> None:
-    """Check options against the frames that a film states and its size; `region` tells whether there is one.
+    """Check options against the frames that a film states and its size, and that the region's picture is none of the frames.
 
     Raises
     ------
     FilmError
         A frame beyond the film's end, a template that is not among the selected frames, a region's frame too far from them, or points
-        closer together than the pixels of the tracker's frames.
+        closer together than the pixels of the tracker's frames; or a mask picture in the film's folder.
     """
     start, stop, step = film.selection
     end = film.stated_frames - 1 if film.stated_frames else None
@@ -62,8 +67,13 @@ def check_against(
         before = max(0, start - step + 1)
         if template_frame < before or (after is not None and template_frame >= after):
             raise no_such_frame("template_frame", template_frame, before, end if after is None else after - 1)
-    if region:
+    if region is not None:
         film.reaching(region_frame)
+        if isinstance(region, str | Path) and is_frame(Path(region), film.path):
+            raise FilmError(
+                "wrong_region", field="region", expected="a mask outside the film's folder of pictures",
+                got=f"{Path(region).name} in it, which would be a frame of the film", hint="Move the mask to another folder.",
+            )  # fmt: skip
     scale = tracking_scale(film.size, longest_side)
     if grid_step is not None and grid_step * scale < 1:
         raise FilmError(

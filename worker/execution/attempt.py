@@ -111,6 +111,8 @@ class Attempt:
     """Monotonic time at which the time limit is reached."""
     unwanted: bool = False
     """Whether the job was cancelled, timed out, or belongs to another attempt."""
+    warnings: Sequence[str] = ()
+    """Warnings about a film, known before its job is solved; they may explain why it fails."""
     _parent: int = field(default_factory=os.getppid)
     _next_report: float = 0.0
     _stage: str = ""
@@ -192,8 +194,9 @@ class Attempt:
                 return lifecycle.stop(held, attempt_id=self.attempt_id, now=now, retention=settings.retention)
             if isinstance(end, Problem):
                 return lifecycle.fail(
-                    held, attempt_id=self.attempt_id, problem=end, now=now, retention=settings.retention
-                )
+                    held, attempt_id=self.attempt_id, problem=end, now=now, retention=settings.retention,
+                    warnings=self.warnings,
+                )  # fmt: skip
             return lifecycle.succeed(
                 held, end, attempt_id=self.attempt_id, prefix=self.prefix, now=now, retention=settings.retention
             )
@@ -327,9 +330,14 @@ def _reconstruct(
     settings, scratch = attempt.jobs.settings, inputs.with_name("film")
     source = open_source(inputs, inputs.with_name("source"))
     scratch.mkdir()
+
+    def on_warnings(warnings: Sequence[str]) -> None:
+        attempt.warnings = warnings
+
     return reconstruct_film(
         source, options, results, scratch=scratch, name=stored.job.name, threads=settings.threads_per_job, bounds=FilmBounds.of(settings),
-        memory=memory_for_a_job(settings), on_progress=attempt.report, should_stop=attempt.should_stop,
+        memory=memory_for_a_job(settings), on_progress=attempt.report, on_warnings=on_warnings,
+        should_stop=attempt.should_stop,
     )  # fmt: skip
 
 

@@ -80,6 +80,8 @@ def reconstruct_film(
         if not source.own_rate:
             options = options.model_copy(update={"fps": tracked.fps})
         inputs = read_tracked(scratch / "tracks.npz", tracked, options)
+        drawn = inputs.interpretation.model_copy(update={"has_region": source.has_region(options)})
+        inputs = replace(inputs, interpretation=drawn)
         check_fits(inputs.interpretation, options, [memory], film=True)
         spent = {"track": time.perf_counter() - began}
         directory.mkdir(parents=True, exist_ok=True)

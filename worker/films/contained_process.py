@@ -37,7 +37,7 @@ PROGRESS_EVERY = 0.2
 FOLLOWED_POINTS = 150
 """Maximum number of points shown while tracking runs: about 1.5 kB in a record that is rewritten twice a second."""
 
-SHARES = {"read": (0.0, 0.15), "locate": (0.15, 0.25), "track": (0.25, 1.0)}
+SHARES = {"read": (0.0, 0.15), "locate": (0.15, 0.25), "track": (0.25, 0.65), "fit": (0.65, 0.8), "refine": (0.8, 1.0)}
 """Start and end of each stage of the tracker, as fractions of the tracking time, from typical timings."""
 
 LOOKED = 1 / 3
@@ -110,15 +110,17 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
         )  # fmt: skip
     with closing(film.frames()) as frames:
         first = next(frames, None)
-        if first is None or (count is not None and count < LEAST_FRAMES):
-            raise film.too_few_frames(count or 0)
+        if first is None:  # the file states more frames than it has
+            raise film.too_few_frames(0)
+        if count is not None and count < LEAST_FRAMES:
+            raise film.too_few_frames(count)
         for frame in frames:  # raises an error if all are equal, as those of an interlaced film are
             if not np.array_equal(frame.image, first.image) or time.process_time() > LOOKED * bounds.check_seconds:
                 break
     region = _region(request)
     if region is not None:
         read_region(region, film.size)
-    check_against(film, region=region is not None, **planned)
+    check_against(film, region=region, **planned)
     facts: dict[str, Any] = {
         "container": film.container, "width": film.size[0], "height": film.size[1], "fps": film.fps / step,
         "stated_frames": film.stated_frames, "frames": count or 0, "seconds": film.stated_frames / film.fps,
@@ -214,7 +216,7 @@ def _observations(step: TrackingStep) -> list[int] | None:
     """Return the expected numbers of frames and points, None while unknown; a few points may be dropped at the end."""
     if step.followed is None or step.total is None:
         return None
-    return [(step.total + 1) // 2, len(step.followed.points)]
+    return [step.total, len(step.followed.points)]
 
 
 def _followed(step: TrackingStep, size: tuple[int, int]) -> dict[str, Any] | None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pliant.schemas.job import Interpretation
+from pliant.schemas.options import Options
 from pliant.worker.formats.errors import damaged
 from pliant.worker.formats.reading.arrays import PICTURE_SUFFIXES, spreadsheet_kind
 from pliant.worker.formats.reading.parsers import film_kind
@@ -42,6 +43,10 @@ class FilmSource:
 
     own_rate: bool = False
     """Whether the job sets the frame rate (`fps`) itself; otherwise it is that of the tracked frames."""
+
+    def has_region(self, options: Options) -> bool:
+        """Return whether a region was given, as a picture or in the options."""
+        return self.region is not None or options.region_polygon is not None
 
     @property
     def names(self) -> dict[str, str]:

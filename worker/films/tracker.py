@@ -199,20 +199,20 @@ def read_film(
     facts = _answer(FilmFacts, ended, bounds, bounds.check_seconds)
     options = film_options(options, facts)
     solver_settings(options)
-    interpretation = described(facts, options)
+    interpretation = described(facts, options, has_region=source.has_region(options))
     if facts.frames and facts.points:
         points = min(facts.points, options.max_points or facts.points)
         interpretation = interpretation.model_copy(update={"estimate": estimated(facts.frames, points, options)})
     return ReadFilm(facts, options, interpretation)
 
 
-def described(facts: FilmFacts, options: Options) -> Interpretation:
+def described(facts: FilmFacts, options: Options, *, has_region: bool = False) -> Interpretation:
     """Return the interpretation of a film before it is tracked."""
     of_all = f" of {facts.stated_frames}" if facts.frames and facts.frames != facts.stated_frames else ""
     count = f"{facts.frames}{of_all} frames" if facts.frames else "frames not counted yet"
     return Interpretation(
         num_frames=facts.frames, num_points=0, num_faces=0, hidden_fraction=0.0, mesh_source="film",
-        has_ground_truth=False, has_rotations=False, layout="tracks (F, P, 2)", format=f"film ({facts.container})",
+        has_ground_truth=False, has_rotations=False, has_region=has_region, layout="tracks (F, P, 2)", format=f"film ({facts.container})",
         given_frames=facts.stated_frames or None, image_size=f"{facts.width}x{facts.height}", fps=facts.fps,
         notes=[f"A film of {facts.width}×{facts.height} pixels, {count}, {options.fps:.3g} frames per second. "
                "Its points are not tracked yet.", *notes_on_rate(facts.container),

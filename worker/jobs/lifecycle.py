@@ -12,7 +12,7 @@ A final status never changes: running a finished job again is a new job (`again`
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timedelta
 
 from pliant.schemas.job import Job, Problem, Progress, Status
@@ -28,7 +28,7 @@ def again(job: Job, *, id: str, now: datetime, **changes: object) -> Job:
     """Return a new queued job with the fields of a finished one, updated by `changes`.
 
     Metrics, outcome, verdict and warnings are kept: a failed or cancelled job has them only if it works from a stored result,
-    which they describe.
+    which they describe; a failed one may have warnings about its film.
     """
     fresh: dict[str, object] = {
         "id": id, "status": Status.QUEUED, "created_at": now, "started_at": None, "finished_at": None, "expires_at": None,
@@ -100,8 +100,16 @@ def succeed(
     return _finish(published, Status.SUCCEEDED, now=now, retention=retention)
 
 
-def fail(stored: Stored, *, attempt_id: str, problem: Problem, now: datetime, retention: float) -> Stored:
-    """Record why the attempt failed; a job that was being cancelled ends cancelled.
+def fail(
+    stored: Stored,
+    *,
+    attempt_id: str,
+    problem: Problem,
+    now: datetime,
+    retention: float,
+    warnings: Sequence[str] = (),
+) -> Stored:
+    """Record why the attempt failed, and its warnings until then; a job that was being cancelled ends cancelled.
 
     Raises
     ------
@@ -111,7 +119,8 @@ def fail(stored: Stored, *, attempt_id: str, problem: Problem, now: datetime, re
     _check_owner(stored, attempt_id)
     if stored.job.status is Status.CANCELLING:
         return stop(stored, attempt_id=attempt_id, now=now, retention=retention)
-    return _finish(_changed(stored, {"error": problem}), Status.FAILED, now=now, retention=retention)
+    update = {"error": problem, "warnings": list(warnings) or stored.job.warnings}
+    return _finish(_changed(stored, update), Status.FAILED, now=now, retention=retention)
 
 
 def stop(stored: Stored, *, attempt_id: str, now: datetime, retention: float) -> Stored:

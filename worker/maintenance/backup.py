@@ -6,7 +6,8 @@
     blobs/…          inputs and results, under their keys in the blob store
 
 Blobs are immutable, and a record names all its blobs. A record that is read before its blobs are copied is therefore consistent with
-them, even while jobs run. A job that is deleted in between is omitted. Restoring requeues jobs that were running.
+them, even while jobs run. A job that is deleted in between is omitted. Restoring requeues jobs that were running, and holds all queued
+ones back: the service's reconciler, which knows its limit of running jobs, queues them.
 """
 
 from __future__ import annotations
@@ -30,7 +31,6 @@ from pliant.worker.execution.failures import worker_lost
 from pliant.worker.ids import new_attempt_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
-from pliant.worker.jobs.submission import order_waiting, push_or_hold
 from pliant.worker.records import Stored, utc_now
 from pliant.worker.settings import Settings
 from pliant.worker.store.schema import CURRENT
@@ -118,14 +118,10 @@ def restore_backup(settings: Settings, source: Path) -> Summary:
     for key in manifest["blobs"]:
         jobs.blobs.put(key, source / "blobs" / key, media_type=kinds.get(key, "application/octet-stream"))
     snapshot.write_rest(json.loads(rest.read_text(encoding="utf-8")))
-    owners = []
     for line in _lines(records):
-        stored = snapshot.write(json.loads(line))
-        _requeue(jobs, stored)
-        owners.append(stored.owner)
-    order_waiting(jobs.records, jobs.queue, set(owners))
+        _requeue(jobs, snapshot.write(json.loads(line)))
     sizes = manifest["blobs"].values()
-    return Summary(jobs=len(owners), blobs=len(sizes), bytes=sum(sizes), copied=len(sizes))
+    return Summary(jobs=manifest["jobs"], blobs=len(sizes), bytes=sum(sizes), copied=len(sizes))
 
 
 def _copy_blobs(jobs: Jobs, stored: Stored, target: Path, kept: dict[str, int]) -> int | None:
@@ -175,7 +171,7 @@ def _media_types(records: Path) -> dict[str, str]:
 
 
 def _requeue(jobs: Jobs, stored: Stored) -> None:
-    """Queue a restored job that has not ended, or hold it back where its owner has reached the limit of running jobs."""
+    """Make a restored job that has not ended a queued one, and hold it back until the service runs."""
     if stored.job.status in lifecycle.ACTIVE:
         change = partial(
             lifecycle.requeue, attempt_id=stored.attempt_id, fresh=new_attempt_id(stored.job.id), max_attempts=None,
@@ -185,7 +181,7 @@ def _requeue(jobs: Jobs, stored: Stored) -> None:
         with suppress(StaleAttempt):
             stored = jobs.records.update(stored.job.id, change)
     if stored.job.status is Status.QUEUED:
-        push_or_hold(jobs, stored)
+        jobs.queue.hold(stored.attempt_id)
 
 
 def read_manifest(source: Path) -> dict[str, Any]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import secrets
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -44,6 +46,9 @@ RETRIES: Any = {
 SWITCHES = ("allow_http", "allow_invalid_certificates", "http1_only", "http2_only")
 TEXTS = ("proxy_url", "proxy_ca_certificate", "proxy_excludes", "user_agent")
 """Connection options for S3, set by the `AWS_…` variables of the same names."""
+
+FAULTS_OF_DISKS = tuple(os.strerror(number) for number in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES))
+"""The system's sentences for a directory that takes no files; they name no path."""
 
 Answer = TypeVar("Answer")
 
@@ -233,8 +238,14 @@ class Blobs:
         return {str(each["path"]): int(each["size"]) for each in self._entries(prefix)}
 
     def check(self) -> None:
-        """Return normally if the store answers."""
-        self._call(lambda: obstore.list_with_delimiter(self._store, "jobs-that-never-are"))
+        """Return normally if the store answers and, if it is a directory, takes files."""
+        if self.directory is None:
+            self._call(lambda: obstore.list_with_delimiter(self._store, "jobs-that-never-are"))
+            return
+        with answering():
+            self.directory.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.directory) as probe:
+                probe.write(bytes(os.statvfs(self.directory).f_bsize))
 
     def _write_to_disk(self, file: Path | None) -> None:
         """Write a local file and the directories that lead to it to the disk, so that a power failure cannot lose or empty it."""
@@ -314,6 +325,5 @@ def answering() -> Iterator[None]:
         raise
     except (BaseError, OSError) as error:
         logger.warning("blob store: %s", str(error).splitlines()[0][:300])
-        full = "No space left on device"
-        reason = full if full in str(error) else type(error).__name__
+        reason = next((fault for fault in FAULTS_OF_DISKS if fault in str(error)), type(error).__name__)
         raise StoreUnavailable("The blob store", reason=reason) from error

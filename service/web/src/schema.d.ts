@@ -229,6 +229,12 @@ export interface components {
              */
             has_rotations: boolean;
             /**
+             * Has Region
+             * @description Whether the region of a film was given, as a mask picture or a polygon.
+             * @default false
+             */
+            has_region: boolean;
+            /**
              * Layout
              * @description How the track array was read, e.g. `tracks (F, P, 2)` or `W (2F, P), rows interleaved`.
              */
@@ -348,6 +354,12 @@ export interface components {
              * @description Whether cameras were given.
              */
             has_rotations: boolean;
+            /**
+             * Has Region
+             * @description Whether the region of a film was given, as a mask picture or a polygon.
+             * @default false
+             */
+            has_region: boolean;
             /**
              * Layout
              * @description How the track array was read, e.g. `tracks (F, P, 2)` or `W (2F, P), rows interleaved`.
@@ -517,7 +529,7 @@ export interface components {
             trust_sentence: string | null;
             /**
              * Warnings
-             * @description Warnings about this result.
+             * @description Warnings about this result, or about the film of a failed job.
              */
             warnings: string[];
             /**

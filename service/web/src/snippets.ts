@@ -85,7 +85,8 @@ function parts(job: Job): [FormPart, ...FormPart[]] {
   const seen = job.interpretation;
   const names = sentNames(job.retry_of && !sentNames(job.id)["film"] ? job.retry_of : job.id);
   const file = (part: string, placeholder: string): FormPart => ({ part, value: names[part] ?? placeholder, isFile: true });
-  if (ofFilm(job)) return [file("film", "film.mp4"), ...(names["region"] ? [file("region", "")] : [])];
+  const masked = names["region"] || (seen.has_region && !job.options["region_polygon"]);
+  if (ofFilm(job)) return [file("film", "film.mp4"), ...(masked ? [file("region", "mask.png")] : [])];
   const found: [FormPart, ...FormPart[]] = [file("tracks", "tracks.npz")];
   if (names["mesh"]) found.push(file("mesh", ""));
   else if (seen.mesh_grid) found.push({ part: "mesh", value: seen.mesh_grid.join("x"), isFile: false });

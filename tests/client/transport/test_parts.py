@@ -14,6 +14,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from PIL import Image
 from pliant.client import BadArgument, Client, NotLoaded, Options, Retry, Unreachable
 from pliant.client.input_files import array_part, existing_file, film_file, mesh_part, region_part, tracks_file
 from pliant.client.multipart import Form, Inputs, checked_options
@@ -170,6 +171,18 @@ def test_an_open_file_that_is_refused_can_still_be_read(tmp_path: Path) -> None:
         with pytest.raises(BadArgument, match="give files by their path"):
             tracks_file(file, None, tmp_path)
         assert file.read() == b"some bytes"
+
+
+def test_a_mask_among_the_pictures_of_a_film_is_refused(tmp_path: Path) -> None:
+    mask = np.full((8, 6), 255, np.uint8)
+    for name in ("1.png", "mask.png"):
+        Image.fromarray(mask).save(tmp_path / name)
+    with pytest.raises(
+        BadArgument, match=r"region: expected a mask outside the film's folder of pictures, got mask\.png in it"
+    ):
+        Inputs(tracks=None, film=tmp_path, region=tmp_path / "mask.png").form(tmp_path, fields={}, on_upload=None)
+    (tmp_path / "film").mkdir()
+    assert region_part(tmp_path / "mask.png", tmp_path, film=tmp_path / "film") == tmp_path / "mask.png"
 
 
 def test_a_region_of_zeros_and_ones_is_a_mask(tmp_path: Path) -> None:

@@ -288,6 +288,7 @@ def test_the_result_of_a_film_shows_its_contact_sheet(filming: Page, url: str, f
         )
     ]
     record = film_record(url, finished, status="succeeded", artifacts=made, sentence="Converged.")
+    record["interpretation"]["has_region"] = True
     answer_with(filming, record)
     filming.route("**/contact_sheet.jpg", lambda route: route.fulfill(body=sheet, content_type="image/jpeg"))
     filming.evaluate("sessionStorage.setItem('pliant-token', '')")
@@ -302,3 +303,4 @@ def test_the_result_of_a_film_shows_its_contact_sheet(filming: Page, url: str, f
     files = filming.get_by_role("region", name="Files").get_by_role("link")
     assert files.all_inner_texts() == ["contact_sheet.jpg", "tracks.npz"]
     expect(filming.get_by_role("region", name="Use from code")).to_contain_text('film="film.mp4"')  # sent elsewhere
+    expect(filming.get_by_role("region", name="Use from code")).to_contain_text('region="mask.png"')

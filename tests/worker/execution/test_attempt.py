@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from pliant.schemas.job import Artifact, Interpretation, Progress, Status
 from pliant.schemas.options import Options
+from pliant.solver.errors import InvalidInput
 from pliant.worker.errors import Interrupted, StoreUnavailable
 from pliant.worker.execution.attempt import Attempt, limited_memory, run, work
 from pliant.worker.execution.failures import problem_of
@@ -94,6 +95,21 @@ def test_a_store_that_hangs_slows_a_job_down_by_at_most_a_quarter(
         attempt.report(Progress(stage="reweight", fraction=0.5, updated_at=datetime.now(UTC)))
         assert not attempt.should_stop()
     assert 200 < now[0] < 200 * 1.25 + 7
+
+
+def test_a_film_job_that_fails_keeps_the_warnings_about_its_film(
+    jobs: Jobs, attempt: Attempt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def reconstruct_film(*_: object, on_warnings: Callable[[Sequence[str]], None], **__: object) -> Finished:
+        on_warnings(["The film has a cut (at frame 10)."])
+        raise InvalidInput("tracks_lost", field="film", expected="points", got="0", hint="Film slowly.")
+
+    monkeypatch.setattr("pliant.worker.films.sources.is_source", lambda _: True)
+    monkeypatch.setattr("pliant.worker.films.sources.open_source", lambda *_: None)
+    monkeypatch.setattr("pliant.worker.execution.film.reconstruct_film", reconstruct_film)
+    problem = work(attempt, jobs.records.get(attempt.id), tmp_path)
+    assert attempt.conclude(problem) == "failed"
+    assert jobs.get(attempt.id).warnings == ["The film has a cut (at frame 10)."]
 
 
 def test_a_limit_of_memory_that_the_system_lacks_is_skipped(monkeypatch: pytest.MonkeyPatch) -> None:

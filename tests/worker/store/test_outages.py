@@ -20,6 +20,7 @@ from pliant.worker.jobs.retry import retry
 from pliant.worker.maintenance.fsck import findings
 from pliant.worker.processes.valkey import disk_is_full, find_binary
 from pliant.worker.settings import Settings
+from pliant.worker.store.blobs import Blobs
 from pliant.worker.store.connection import connect
 from worker_house import House, running, settled
 
@@ -175,6 +176,23 @@ def test_a_full_blob_store_refuses_the_job_and_keeps_nothing(
         assert house.jobs.page().jobs == []
         assert house.jobs.records.used() == 0
         assert findings(house.jobs, pause=0) == []
+
+
+@pytest.mark.parametrize("reason", ["No space left on device", "Read-only file system"])
+def test_a_disk_that_takes_no_files_is_not_ready(small_disk: Path, tmp_path: Path, reason: str) -> None:
+    blobs, file = Blobs.open((small_disk / "blobs").as_uri()), tmp_path / "file"
+    file.write_bytes(b"x" * 10_000)
+    blobs.put("jobs/a", file)
+    blobs.check()
+    if reason.startswith("No space"):
+        with pytest.raises(OSError, match=reason):
+            (small_disk / "filler").write_bytes(b"x" * (4 << 20))
+    else:
+        subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    for call in (blobs.check, lambda: blobs.put("jobs/b", file)):
+        with pytest.raises(StoreUnavailable, match=reason):
+            call()
+    assert blobs.get("jobs/a").size == 10_000
 
 
 def test_valkey_on_a_full_disk_refuses_jobs_and_loses_none(
