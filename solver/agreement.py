@@ -5,12 +5,14 @@ Nothing here needs SciPy, so a reader can refuse a job before it is queued.
 
 from __future__ import annotations
 
+from math import radians, tan
+
 import numpy as np
 from pliant.solver.errors import InvalidInput, InvalidSettings, shape_text, wrong_input
 from pliant.solver.limits import MAX_COORDINATE, MAX_UNORDERED_FRAMES, frame_chunks
 from pliant.solver.mesh import Mesh
 from pliant.solver.records import MIN_FRAMES, MIN_POINTS, Floats, KnownCamera, Tracks
-from pliant.solver.settings import Settings
+from pliant.solver.settings import MAX_FIELD_OF_VIEW, Settings
 
 MAKE_TRACKS = "Use Tracks.from_arrays(points, visible), which validates and converts."
 MAKE_MESH = "Use Mesh.from_faces(faces, num_points)."
@@ -24,7 +26,7 @@ MAX_CENTRE_RADII = 100.0
 def check_agreement(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None, settings: Settings) -> None:
     """Check that mesh and given cameras match the tracks, and the settings all of them.
 
-    `check_principal_point` is separate, because it needs normalized tracks.
+    `check_principal_point` and `check_focal` are separate, because they need normalized tracks.
 
     Raises
     ------
@@ -182,6 +184,36 @@ def check_principal_point(centroids: Floats, unit: float, point: Floats) -> None
             "principal_point_far", field="options.principal_point",
             expected=f"a point within {MAX_CENTRE_RADII:.0f} RMS radii of the tracks",
             got=f"({point[0]:.5g}, {point[1]:.5g})", hint="Give x, y in the unit and axes of the tracks.",
+        )  # fmt: skip
+
+
+def check_focal(unit: float, settings: Settings, known: float | None = None) -> None:
+    """Check that a given focal length, if there is one, is not far below the size of the tracks, as one in millimetres is.
+
+    Parameters
+    ----------
+    unit : float
+        RMS radius of the tracks.
+    settings : Settings
+        With `focal` or `field_of_view`.
+    known : float, optional
+        Focal length of given cameras, which counts before that of the settings.
+
+    Raises
+    ------
+    InvalidSettings
+        The RMS radius is seen at more than half of `MAX_FIELD_OF_VIEW` from the optical axis.
+    """
+    focal, field = known, "cameras.focal"
+    if focal is None:
+        focal, field = settings.focal_length, "options.focal" if settings.field_of_view is None else "options.field_of_view"
+    least = unit / tan(radians(MAX_FIELD_OF_VIEW / 2))
+    if focal is not None and focal < least:
+        raise InvalidSettings(
+            "invalid_option", field=field,
+            expected=f"a focal length of at least {least:.4g} pixels for tracks with an RMS radius of {unit:.4g}", got=f"{focal:.4g}",
+            hint="Give it in pixels of the tracks, not in millimetres: divide millimetres by the sensor's width, and multiply by the "
+            "picture's width in pixels.",
         )  # fmt: skip
 
 

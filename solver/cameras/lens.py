@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from pliant.solver.agreement import check_principal_point
+from pliant.solver.agreement import check_focal, check_principal_point
 from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.records import KnownCamera
 from pliant.solver.settings import Settings
@@ -18,7 +18,7 @@ def given_lens(normalized: Normalized, settings: Settings, cameras: KnownCamera 
     Raises
     ------
     InvalidInput
-        The principal point is too far from the tracks.
+        The principal point is too far from the tracks, or the focal length far below their size.
     """
     given = settings.focal_length
     centre = settings.centre
@@ -36,6 +36,7 @@ def given_lens(normalized: Normalized, settings: Settings, cameras: KnownCamera 
         point = normalized.centroid.mean(axis=0)
     offsets = (normalized.centroid - point) / normalized.unit
     check_principal_point(normalized.centroid, normalized.unit, point)
+    check_focal(normalized.unit, settings, None if cameras is None else cameras.focal)
     first = -1 if settings.y_up else 1
     return Perspective(
         offsets,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, KnownCamera, Mesh, Tracks
-from pliant.solver.agreement import check_agreement, check_principal_point, check_seen
+from pliant.solver.agreement import check_agreement, check_focal, check_principal_point, check_seen
 from pliant.solver.limits import MAX_COORDINATE
 from pliant.solver.tracks.normalization import normalize
 from pliant.worker.formats.cost import estimated
@@ -111,8 +111,11 @@ def check_options(
     """
     settings = solver_settings(options, y_up=y_axis == "up")
     check_agreement(tracks, mesh, cameras, settings)
+    if settings.principal_point is None and settings.focal_length is None:
+        return
+    normalized = normalize(tracks)
+    check_focal(normalized.unit, settings)
     if settings.principal_point is not None:
-        normalized = normalize(tracks)
         check_principal_point(normalized.centroid, normalized.unit, np.array(settings.principal_point))
 
 

@@ -356,6 +356,25 @@ def test_a_distant_principal_point_is_rejected() -> None:
     assert refused.value.code == "principal_point_far"
 
 
+def test_a_focal_length_in_millimetres_is_refused() -> None:
+    tracks = pinhole(SEEN, FOCAL)
+    normalized = normalize(tracks)
+    wide = {"field_of_view": 179.0, "image_size": PICTURE}
+    known = KnownCamera.from_arrays(FACE.rotations, focal=4.2)
+    for settings, cameras, field in (
+        (Settings(focal=4.2), None, "options.focal"),
+        (Settings(**wide), None, "options.field_of_view"),
+        (Settings(), known, "cameras.focal"),
+    ):
+        with pytest.raises(InvalidSettings, match="not in millimetres") as refused:
+            given_lens(normalized, settings, cameras)
+        assert refused.value.field == field
+    with pytest.raises(InvalidSettings, match="not in millimetres"):
+        Settings(focal=24, image_size=PICTURE)
+    assert given_lens(normalized, Settings(focal=normalized.unit / 3.7)) is not None
+    assert Settings(focal=PICTURE[0] / 7.4, image_size=PICTURE).focal is not None
+
+
 def test_different_focal_lengths_in_cameras_and_settings_are_rejected() -> None:
     cameras = KnownCamera.from_arrays(FACE.rotations, focal=FOCAL)
     with pytest.raises(InvalidInput) as refused:
