@@ -206,7 +206,10 @@ def check_focal(unit: float, settings: Settings, known: float | None = None) -> 
     """
     focal, field = known, "cameras.focal"
     if focal is None:
-        focal, field = settings.focal_length, "options.focal" if settings.field_of_view is None else "options.field_of_view"
+        focal, field = (
+            settings.focal_length,
+            "options.focal" if settings.field_of_view is None else "options.field_of_view",
+        )
     least = unit / tan(radians(MAX_FIELD_OF_VIEW / 2))
     if focal is not None and focal < least:
         raise InvalidSettings(

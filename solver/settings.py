@@ -84,7 +84,8 @@ class Settings:
     """λ2, dimensionless; None takes the preset's value. Unused without a mesh."""
 
     robust_scale: float | None = None
-    """ε of the smoothed L1 (r ↦ √(r² + ε²)) or δ of Huber, in normalized units; None takes the preset's value."""
+    """ε of the smoothed L1 (r ↦ √(r² + ε²)) or δ of Huber, in normalized units; None takes the preset's value. Automatic λ1 and λ2 follow
+    a given one, so that it decides only from which residual on the loss grows linearly."""
 
     temporal_order: Literal[1, 2] | None = None
     """Order of the difference operator H; None takes the preset's value. Has no effect with the Gaussian prior, which is reported."""
