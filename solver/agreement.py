@@ -22,6 +22,10 @@ MAKE_CAMERAS = "Use KnownCamera.from_arrays(rotations, scales), which validates 
 MAX_CENTRE_RADII = 100.0
 """Maximum distance, along x and along y, of a principal point from the frames' centroids, RMS radii: a view of 1° or more."""
 
+SHARED_SHARE, SHARED_POINTS, SHARED_SAMPLE = 0.01, 3, (300, 1000)
+"""Share of the visible positions that are the same one, and number of points with it, above which it probably marks hidden points; and the
+numbers of frames and of points in which it is looked for. Tracked points hardly ever meet exactly."""
+
 
 def check_agreement(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None, settings: Settings) -> None:
     """Check that mesh and given cameras match the tracks, and the settings all of them.
@@ -160,6 +164,26 @@ def check_seen(visible: Floats) -> None:
 def seen_again(visible: Floats) -> int:
     """Return the number of points that are visible in two or more frames."""
     return int(((visible > 0).sum(axis=0) >= 2).sum())
+
+
+def shared_position_warnings(tracks: Tracks) -> tuple[str, ...]:
+    """Return a warning if several points are at exactly the same position in many frames, which marks hidden points in some files."""
+    frames, points = (max(1, -(-size // most)) for size, most in zip(tracks.visible.shape, SHARED_SAMPLE, strict=True))
+    seen = tracks.visible[::frames, ::points] > 0
+    which = np.nonzero(seen)[1]
+    places, place_of, counts = np.unique(
+        tracks.points[::frames, ::points][seen], axis=0, return_inverse=True, return_counts=True
+    )
+    if len(places) == 0:
+        return ()
+    most = int(np.argmax(counts))
+    if counts[most] < SHARED_SHARE * len(which) or len(np.unique(which[place_of.ravel() == most])) < SHARED_POINTS:
+        return ()
+    x, y = places[most]
+    return (
+        f"{counts[most] / len(which):.0%} of the visible positions are exactly ({x:g}, {y:g}), for several points. "
+        "If this marks hidden points, set their visibility to 0, or the position to NaN.",
+    )
 
 
 def check_principal_point(centroids: Floats, unit: float, point: Floats) -> None:

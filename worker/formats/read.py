@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, KnownCamera, Mesh, Tracks
-from pliant.solver.agreement import check_agreement, check_focal, check_principal_point, check_seen
+from pliant.solver.agreement import (
+    check_agreement,
+    check_focal,
+    check_principal_point,
+    check_seen,
+    shared_position_warnings,
+)
 from pliant.solver.limits import MAX_COORDINATE
 from pliant.solver.tracks.normalization import normalize
 from pliant.worker.formats.cost import estimated
@@ -69,7 +75,7 @@ def read_inputs(
     notes = [
         *notes_on_options(options, film=False), *understood.notes,
         *unused_arrays(tracks, understood, has_mesh=mesh is not None, has_truth=truth is not None),
-        *chosen.notes, *truth_notes,
+        *chosen.notes, *truth_notes, *shared_position_warnings(chosen.tracks),
     ]  # fmt: skip
     interpretation = _interpretation(
         understood, chosen, film, notes, has_truth=truth is not None, has_rotations=cameras is not None
