@@ -186,6 +186,25 @@ def shared_position_warnings(tracks: Tracks) -> tuple[str, ...]:
     )
 
 
+def separate_points_warnings(tracks: Tracks) -> tuple[str, ...]:
+    """Return a warning if no chain of frames that share points connects all points that are visible in two or more frames."""
+    seen = tracks.visible > 0
+    often = seen.sum(axis=0) >= 2
+    reached = seen[np.argmax(seen.sum(axis=1))]
+    before = -1
+    while before < (before := int(reached.sum())):
+        for shown in (*seen, *seen[::-1]):
+            if (shown & reached).any():
+                reached = reached | shown
+    apart = int((often & ~reached).sum())
+    if apart < MIN_POINTS:
+        return ()
+    return (
+        f"No frame connects {apart} of the points to the others, as in tracks across a cut: how they lie to each other is a guess. "
+        "Solve each part of the film on its own.",
+    )
+
+
 def check_principal_point(centroids: Floats, unit: float, point: Floats) -> None:
     """Check that a principal point is near the tracks.
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from pliant.solver.agreement import check_agreement, shared_position_warnings
+from pliant.solver.agreement import check_agreement, separate_points_warnings, shared_position_warnings
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import pulses_to
@@ -88,7 +88,7 @@ def solve(
 def _with_report(solution: Solution, tracks: Tracks, why: str) -> Solution:
     """Return the solution with the reason for the order of the frames, and warnings about the tracks."""
     choices = solution.choices
-    warnings = (*shared_position_warnings(tracks), *choices.warnings)
+    warnings = (*shared_position_warnings(tracks), *separate_points_warnings(tracks), *choices.warnings)
     return replace(solution, choices=replace(choices, reasons={**choices.reasons, "order": why}, warnings=warnings))
 
 

@@ -16,6 +16,7 @@ from pliant.solver.agreement import (
     check_focal,
     check_principal_point,
     check_seen,
+    separate_points_warnings,
     shared_position_warnings,
 )
 from pliant.solver.limits import MAX_COORDINATE
@@ -76,6 +77,7 @@ def read_inputs(
         *notes_on_options(options, film=False), *understood.notes,
         *unused_arrays(tracks, understood, has_mesh=mesh is not None, has_truth=truth is not None),
         *chosen.notes, *truth_notes, *shared_position_warnings(chosen.tracks),
+        *separate_points_warnings(chosen.tracks),
     ]  # fmt: skip
     interpretation = _interpretation(
         understood, chosen, film, notes, has_truth=truth is not None, has_rotations=cameras is not None
