@@ -144,6 +144,11 @@ class Settings:
         return self.camera in ("orthographic", "scaled_orthographic")
 
     @property
+    def gives_weights(self) -> bool:
+        """Whether λ1 or λ2 is given."""
+        return self.temporal_weight is not None or self.spatial_weight is not None
+
+    @property
     def estimates_scales(self) -> bool:
         """Whether every frame may have its own scale."""
         return self.camera != "orthographic"
