@@ -205,7 +205,7 @@ def separate_points_warnings(tracks: Tracks) -> tuple[str, ...]:
     )
 
 
-def check_principal_point(centroids: Floats, unit: float, point: Floats) -> None:
+def check_principal_point(centroids: Floats, unit: float, point: Floats, *, of_picture: bool = False) -> None:
     """Check that a principal point is near the tracks.
 
     Parameters
@@ -216,6 +216,8 @@ def check_principal_point(centroids: Floats, unit: float, point: Floats) -> None
         RMS radius of the tracks.
     point : array, shape (2,)
         Principal point, in the unit of the centroids.
+    of_picture : bool
+        Whether it is the centre of `image_size`, for the error.
 
     Raises
     ------
@@ -223,10 +225,15 @@ def check_principal_point(centroids: Floats, unit: float, point: Floats) -> None
         More than `MAX_CENTRE_RADII` from the centroid of a frame.
     """
     if not np.abs(centroids - point).max() < MAX_CENTRE_RADII * unit:
+        middle = centroids.mean(axis=0)
         raise InvalidInput(
-            "principal_point_far", field="options.principal_point",
-            expected=f"a point within {MAX_CENTRE_RADII:.0f} RMS radii of the tracks",
-            got=f"({point[0]:.5g}, {point[1]:.5g})", hint="Give x, y in the unit and axes of the tracks.",
+            "principal_point_far", field="options.image_size" if of_picture else "options.principal_point",
+            expected=f"a {'centre' if of_picture else 'point'} within {MAX_CENTRE_RADII:.0f} RMS radii of the tracks, which lie around "
+            f"({middle[0]:.5g}, {middle[1]:.5g})",
+            got=f"({point[0]:.5g}, {point[1]:.5g})",
+            hint="Multiply tracks that are fractions of the picture by its size in pixels."
+            if of_picture
+            else "Give x, y in the unit and axes of the tracks.",
         )  # fmt: skip
 
 

@@ -353,7 +353,15 @@ def test_a_distant_principal_point_is_rejected() -> None:
     tracks = pinhole(SEEN, FOCAL)
     with pytest.raises(InvalidInput) as refused:
         given_lens(normalize(tracks), Settings(principal_point=(1e7, 0.0)))
-    assert refused.value.code == "principal_point_far"
+    assert (refused.value.code, refused.value.field) == ("principal_point_far", "options.principal_point")
+
+
+def test_fractions_of_the_picture_with_its_size_in_pixels_are_rejected() -> None:
+    tracks = pinhole(SEEN, FOCAL)
+    fractions = Tracks.from_arrays(tracks.points / np.array(PICTURE), tracks.visible)
+    with pytest.raises(InvalidInput, match="tracks that are fractions") as refused:
+        given_lens(normalize(fractions), Settings(image_size=PICTURE))
+    assert (refused.value.code, refused.value.field) == ("principal_point_far", "options.image_size")
 
 
 def test_a_focal_length_in_millimetres_is_refused() -> None:
