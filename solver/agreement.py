@@ -5,12 +5,14 @@ Nothing here needs SciPy, so a reader can refuse a job before it is queued.
 
 from __future__ import annotations
 
+from math import radians, tan
+
 import numpy as np
 from pliant.solver.errors import InvalidInput, InvalidSettings, shape_text, wrong_input
 from pliant.solver.limits import MAX_COORDINATE, MAX_UNORDERED_FRAMES, frame_chunks
 from pliant.solver.mesh import Mesh
 from pliant.solver.records import MIN_FRAMES, MIN_POINTS, Floats, KnownCamera, Tracks
-from pliant.solver.settings import Settings
+from pliant.solver.settings import MAX_FIELD_OF_VIEW, Settings
 
 MAKE_TRACKS = "Use Tracks.from_arrays(points, visible), which validates and converts."
 MAKE_MESH = "Use Mesh.from_faces(faces, num_points)."
@@ -20,11 +22,15 @@ MAKE_CAMERAS = "Use KnownCamera.from_arrays(rotations, scales), which validates 
 MAX_CENTRE_RADII = 100.0
 """Maximum distance, along x and along y, of a principal point from the frames' centroids, RMS radii: a view of 1° or more."""
 
+SHARED_SHARE, SHARED_POINTS, SHARED_SAMPLE = 0.01, 3, (300, 1000)
+"""Share of the visible positions that are the same one, and number of points with it, above which it probably marks hidden points; and the
+numbers of frames and of points in which it is looked for. Tracked points hardly ever meet exactly."""
+
 
 def check_agreement(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None, settings: Settings) -> None:
     """Check that mesh and given cameras match the tracks, and the settings all of them.
 
-    `check_principal_point` is separate, because it needs normalized tracks.
+    `check_principal_point` and `check_focal` are separate, because they need normalized tracks.
 
     Raises
     ------
@@ -160,7 +166,46 @@ def seen_again(visible: Floats) -> int:
     return int(((visible > 0).sum(axis=0) >= 2).sum())
 
 
-def check_principal_point(centroids: Floats, unit: float, point: Floats) -> None:
+def shared_position_warnings(tracks: Tracks) -> tuple[str, ...]:
+    """Return a warning if several points are at exactly the same position in many frames, which marks hidden points in some files."""
+    frames, points = (max(1, -(-size // most)) for size, most in zip(tracks.visible.shape, SHARED_SAMPLE, strict=True))
+    seen = tracks.visible[::frames, ::points] > 0
+    which = np.nonzero(seen)[1]
+    places, place_of, counts = np.unique(
+        tracks.points[::frames, ::points][seen], axis=0, return_inverse=True, return_counts=True
+    )
+    if len(places) == 0:
+        return ()
+    most = int(np.argmax(counts))
+    if counts[most] < SHARED_SHARE * len(which) or len(np.unique(which[place_of.ravel() == most])) < SHARED_POINTS:
+        return ()
+    x, y = places[most]
+    return (
+        f"{counts[most] / len(which):.0%} of the visible positions are exactly ({x:g}, {y:g}), for several points. "
+        "If this marks hidden points, set their visibility to 0, or the position to NaN.",
+    )
+
+
+def separate_points_warnings(tracks: Tracks) -> tuple[str, ...]:
+    """Return a warning if no chain of frames that share points connects all points that are visible in two or more frames."""
+    seen = tracks.visible > 0
+    often = seen.sum(axis=0) >= 2
+    reached = seen[np.argmax(seen.sum(axis=1))]
+    before = -1
+    while before < (before := int(reached.sum())):
+        for shown in (*seen, *seen[::-1]):
+            if (shown & reached).any():
+                reached = reached | shown
+    apart = int((often & ~reached).sum())
+    if apart < MIN_POINTS:
+        return ()
+    return (
+        f"No frame connects {apart} of the points to the others, as in tracks across a cut: how they lie to each other is a guess. "
+        "Solve each part of the film on its own.",
+    )
+
+
+def check_principal_point(centroids: Floats, unit: float, point: Floats, *, of_picture: bool = False) -> None:
     """Check that a principal point is near the tracks.
 
     Parameters
@@ -171,6 +216,8 @@ def check_principal_point(centroids: Floats, unit: float, point: Floats) -> None
         RMS radius of the tracks.
     point : array, shape (2,)
         Principal point, in the unit of the centroids.
+    of_picture : bool
+        Whether it is the centre of `image_size`, for the error.
 
     Raises
     ------
@@ -178,10 +225,48 @@ def check_principal_point(centroids: Floats, unit: float, point: Floats) -> None
         More than `MAX_CENTRE_RADII` from the centroid of a frame.
     """
     if not np.abs(centroids - point).max() < MAX_CENTRE_RADII * unit:
+        middle = centroids.mean(axis=0)
         raise InvalidInput(
-            "principal_point_far", field="options.principal_point",
-            expected=f"a point within {MAX_CENTRE_RADII:.0f} RMS radii of the tracks",
-            got=f"({point[0]:.5g}, {point[1]:.5g})", hint="Give x, y in the unit and axes of the tracks.",
+            "principal_point_far", field="options.image_size" if of_picture else "options.principal_point",
+            expected=f"a {'centre' if of_picture else 'point'} within {MAX_CENTRE_RADII:.0f} RMS radii of the tracks, which lie around "
+            f"({middle[0]:.5g}, {middle[1]:.5g})",
+            got=f"({point[0]:.5g}, {point[1]:.5g})",
+            hint="Multiply tracks that are fractions of the picture by its size in pixels."
+            if of_picture
+            else "Give x, y in the unit and axes of the tracks.",
+        )  # fmt: skip
+
+
+def check_focal(unit: float, settings: Settings, known: float | None = None) -> None:
+    """Check that a given focal length, if there is one, is not far below the size of the tracks, as one in millimetres is.
+
+    Parameters
+    ----------
+    unit : float
+        RMS radius of the tracks.
+    settings : Settings
+        With `focal` or `field_of_view`.
+    known : float, optional
+        Focal length of given cameras, which counts before that of the settings.
+
+    Raises
+    ------
+    InvalidSettings
+        The RMS radius is seen at more than half of `MAX_FIELD_OF_VIEW` from the optical axis.
+    """
+    focal, field = known, "cameras.focal"
+    if focal is None:
+        focal, field = (
+            settings.focal_length,
+            "options.focal" if settings.field_of_view is None else "options.field_of_view",
+        )
+    least = unit / tan(radians(MAX_FIELD_OF_VIEW / 2))
+    if focal is not None and focal < least:
+        raise InvalidSettings(
+            "invalid_option", field=field,
+            expected=f"a focal length of at least {least:.4g} pixels for tracks with an RMS radius of {unit:.4g}", got=f"{focal:.4g}",
+            hint="Give it in pixels of the tracks, not in millimetres: divide millimetres by the sensor's width, and multiply by the "
+            "picture's width in pixels.",
         )  # fmt: skip
 
 

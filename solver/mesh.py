@@ -10,7 +10,7 @@ from pliant.solver.errors import numeric, shape_text, wrong_input
 from pliant.solver.records import Ints, read_only
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Mesh:
     """Faces that connect the points. Vertex i is point i; the order is never changed."""
 
@@ -22,6 +22,9 @@ class Mesh:
 
     grid: Ints | None = None
     """Point index of every cell of a pixel grid, −1 for holes, shape `(rows, columns)`; None without a grid."""
+
+    def __repr__(self) -> str:
+        return f"<Mesh of {self.num_points} points, faces of shape {np.shape(self.faces)}>"
 
     @classmethod
     def from_faces(cls, faces: ArrayLike, num_points: int) -> Mesh:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from pliant.solver.agreement import check_agreement
+from pliant.solver.agreement import check_agreement, separate_points_warnings, shared_position_warnings
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import pulses_to
@@ -78,15 +78,18 @@ def solve(
     monitor = monitored(tracks, cameras, settings, on_step, should_stop, sheet=sheet)
     with serial_blas(), pulses_to(monitor.pulse):
         if settings.order == "film":
-            return _with_reason(_solved(tracks, mesh, cameras, settings, monitor, scratch), why)
+            return _with_report(_solved(tracks, mesh, cameras, settings, monitor, scratch), tracks, why)
         order = content_order(differences(tracks))
         moved, cameras = in_order(tracks, cameras, order)
-        return _with_reason(as_they_came(_solved(moved, mesh, cameras, settings, monitor, scratch), order), why)
+        solution = as_they_came(_solved(moved, mesh, cameras, settings, monitor, scratch), order)
+        return _with_report(solution, tracks, why)
 
 
-def _with_reason(solution: Solution, why: str) -> Solution:
-    choices = replace(solution.choices, reasons={**solution.choices.reasons, "order": why})
-    return replace(solution, choices=choices)
+def _with_report(solution: Solution, tracks: Tracks, why: str) -> Solution:
+    """Return the solution with the reason for the order of the frames, and warnings about the tracks."""
+    choices = solution.choices
+    warnings = (*shared_position_warnings(tracks), *separate_points_warnings(tracks), *choices.warnings)
+    return replace(solution, choices=replace(choices, reasons={**choices.reasons, "order": why}, warnings=warnings))
 
 
 def _solved(

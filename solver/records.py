@@ -26,7 +26,7 @@ def read_only(array: NDArray[np.generic]) -> None:
     array.flags.writeable = False
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Tracks:
     """Dense 2-D point tracks: the image positions of P points in F frames. Make them with `from_arrays`, which validates and converts.
 
@@ -102,6 +102,9 @@ class Tracks:
         read_only(positions)
         read_only(confidence)
         return cls(positions, confidence)
+
+    def __repr__(self) -> str:
+        return f"<Tracks of shape {np.shape(self.points)}>"
 
     @property
     def num_frames(self) -> int:
@@ -199,7 +202,7 @@ class Camera:
         return np.column_stack([(self.translations - self.principal_point) / self.scales[:, None], away])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class KnownCamera:
     """Cameras given by the user instead of estimated ones."""
 
@@ -216,6 +219,10 @@ class KnownCamera:
 
     principal_point: tuple[float, float] | None = None
     """(x, y), the tracks' unit; None takes it from the settings."""
+
+    def __repr__(self) -> str:
+        lens = "" if self.focal is None else f", focal length {self.focal:.4g}"
+        return f"<KnownCamera of {len(self.rotations)} frames, scales {'estimated' if self.scales is None else 'given'}{lens}>"
 
     @classmethod
     def from_arrays(

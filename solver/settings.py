@@ -84,7 +84,8 @@ class Settings:
     """λ2, dimensionless; None takes the preset's value. Unused without a mesh."""
 
     robust_scale: float | None = None
-    """ε of the smoothed L1 (r ↦ √(r² + ε²)) or δ of Huber, in normalized units; None takes the preset's value."""
+    """ε of the smoothed L1 (r ↦ √(r² + ε²)) or δ of Huber, in normalized units; None takes the preset's value. Automatic λ1 and λ2 follow
+    a given one, so that it decides only from which residual on the loss grows linearly."""
 
     temporal_order: Literal[1, 2] | None = None
     """Order of the difference operator H; None takes the preset's value. Has no effect with the Gaussian prior, which is reported."""
@@ -141,6 +142,11 @@ class Settings:
     def is_orthographic(self) -> bool:
         """Whether the camera model has no perspective."""
         return self.camera in ("orthographic", "scaled_orthographic")
+
+    @property
+    def gives_weights(self) -> bool:
+        """Whether λ1 or λ2 is given."""
+        return self.temporal_weight is not None or self.spatial_weight is not None
 
     @property
     def estimates_scales(self) -> bool:
@@ -223,15 +229,20 @@ MAX_CENTRE_DISTANCE = 10.0
 """Maximum distance of the principal point from the image, in image sizes: a crop may keep a tenth of the original."""
 
 
+MAX_FIELD_OF_VIEW = 150.0
+"""Horizontal angle of view, degrees, above which a given focal length is refused: the widest lenses without distortion have 127°, and
+a focal length in millimetres, taken for pixels, gives 150° or more for all but long lenses."""
+
+
 def check_pinhole(settings: Settings) -> None:
     """Validate the settings of a pinhole camera.
 
     Raises
     ------
     InvalidSettings
-        A focal length or size that is not positive and finite; both `focal` and `field_of_view`; an angle without `image_size` or outside
-        0 to 180 degrees; a focal length or angle with an orthographic camera; a principal point that is not finite or too far outside the
-        image.
+        A focal length or size that is not positive and finite; a focal length with which the image is wider than `MAX_FIELD_OF_VIEW`; both
+        `focal` and `field_of_view`; an angle without `image_size` or outside 0 to 180 degrees; a focal length or angle with an
+        orthographic camera; a principal point that is not finite or too far outside the image.
     """
     focal, angle, centre, size = settings.focal, settings.field_of_view, settings.principal_point, settings.image_size
     if focal is not None and not (math.isfinite(focal) and focal > 0):
@@ -240,6 +251,12 @@ def check_pinhole(settings: Settings) -> None:
         raise _out_of_range("field_of_view", "an angle between 0 and 180 degrees, or None", angle)
     if size is not None and not (len(size) == 2 and all(math.isfinite(each) and each > 0 for each in size)):
         raise _out_of_range("image_size", "two positive numbers, width and height, or None", size)
+    if focal is not None and size is not None and focal < (least := size[0] / 2 / tan(radians(MAX_FIELD_OF_VIEW / 2))):
+        raise _contradiction(
+            "focal", f"at least {least:.4g} pixels for a picture {size[0]:g} pixels wide", f"{focal:g}",
+            "Give the focal length in pixels, not in millimetres: divide millimetres by the sensor's width, and multiply by the "
+            "picture's width in pixels.",
+        )  # fmt: skip
     if focal is not None and angle is not None:
         raise _contradiction(
             "field_of_view", "either focal or field_of_view", f"both: {focal} and {angle}", "Leave one out."

@@ -54,6 +54,9 @@ longer grows, because the ranks tried end at 40; and the ratio of the times of c
 GRAM_SECONDS = 1e-9
 """Seconds per point and squared number of frames for the Gram matrix of all tracks: 8 operations, 10 s for 100 × 1,000,000."""
 
+FACTORIZATION_SECONDS = 2e-6
+"""Seconds per squared number of frames for the leading eigenvectors of the Gram matrix of all frames: 5 for 2,000 frames, 15 for 3,000."""
+
 UNITS = {
     "multistart": (1600, 120, 1.3),
     "model_order": (1000, 360, 0.6),
@@ -148,8 +151,11 @@ def planned(
     most_frames, most_points = MOST_COMPLETED
     filled = COMPLETION_SECONDS * frames * min(frames, most_frames) * min(points, most_points) if unseen > 0 else 0.0
     used = learned_frames(frames) if ordered else frames
-    filled += GRAM_SECONDS * used**2 * points
+    whole = used if gaussian else frames
+    filled += GRAM_SECONDS * whole**2 * points
     first.append(Stage("completion", 0.1 + filled, 6, growth=RANK_GROWTH))
+    if not gaussian and not known_cameras:
+        first.append(Stage("factorization", FACTORIZATION_SECONDS * frames**2, 1))
     learned = learning(frames, used, gaussian=gaussian, known_cameras=known_cameras, known_scales=known_scales)
     return (*first, *learned, start, shapes, *last)
 

@@ -138,12 +138,14 @@ def estimate_cameras(
     """
     ordered = settings.order != "any"
     completed = complete(normalized, seed=settings.seed, rank=rank, should_stop=should_stop)
-    enter(should_stop, "multistart")
+    enter(should_stop, "factorization")
     scales, scale_reason = rigid_evidence(completed.gram, settings)
+    should_stop()
     gram = completed.gram / np.outer(np.repeat(scales, 2), np.repeat(scales, 2))
     used = every_nth(len(scales), MULTISTART_FRAMES)
     part = of_frames(gram, used)
     sizes = _sizes(completed, settings)
+    enter(should_stop, "multistart")
     factorized, entries = _factorized(gram, part, used, sizes, ordered=ordered, should_stop=should_stop)
     best, ran = min(entries, key=lambda candidate: candidate.energy), entries
     if settings.refine_rotations:

@@ -19,7 +19,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.factorization import leading_factor
+from pliant.solver.cameras.factorization import leading_eigenpairs, leading_factor
 from pliant.solver.cameras.multistart import carried
 from pliant.solver.cameras.scale import rigid_scales
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, fit, start
@@ -83,9 +83,9 @@ class PlanarCameras:
 
 def is_planar(gram: Floats) -> bool:
     """Whether tracks with this Gram matrix show a planar object; points on one line count as planar."""
-    values = np.linalg.eigvalsh(gram)[::-1]
-    if len(values) < 6:
+    if len(gram) < 6:
         return False
+    values, _ = leading_eigenpairs(gram, 3)
     # For points on a line, the second eigenvalue is noise.
     return bool(values[2] < MAX_PLANAR_RATIO * max(values[1], MAX_PLANAR_RATIO * values[0]))
 

@@ -8,7 +8,8 @@ the tracks, which penalises each mode of deformation, is clearly higher with sca
 from __future__ import annotations
 
 import numpy as np
-from pliant.solver.cameras.factorization import upgrade
+from pliant.solver.cameras.factorization import leading_eigenpairs, upgrade
+from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats, mean_scale, projections_of
 from pliant.solver.settings import Settings
 
@@ -36,7 +37,7 @@ def rigid_evidence(gram: Floats, settings: Settings) -> tuple[Floats, str]:
     rotations = upgrade(gram, 1).rotations
     scales = rigid_scales(gram, rotations)
     total = float(np.trace(gram))
-    affine = float(np.linalg.eigvalsh(gram)[:-3].sum()) / total
+    affine = 1 - float(leading_eigenpairs(gram, 3)[0].sum()) / total
     without, with_them = _unexplained(gram, rotations, none) / total, _unexplained(gram, rotations, scales) / total
     share = (without - with_them) / max(without - affine, 1e-12)
     if share > SCALE_SHARE and with_them < RIGID_ENOUGH and np.log(scales).std() < WIDEST:
@@ -60,6 +61,7 @@ def rigid_scales(gram: Floats, rotations: Floats) -> Floats:
     frames = len(rotations)
     scales = np.ones(frames)
     for _ in range(ALTERNATIONS):
+        pulse()
         rows = projections_of(rotations, scales).reshape(2 * frames, 3)
         pseudo = np.linalg.pinv(rows)
         shape_gram, cross = pseudo @ gram @ pseudo.T, (gram @ pseudo.T).reshape(frames, 2, 3)

@@ -137,12 +137,25 @@ def _from_covariance(covariance: ShapeCovariance, settings: Settings) -> tuple[W
     """
     sigma = noise_std(covariance)
     scale = float(np.clip(sigma, ROBUST_SCALE_RANGE[0], MAX_ROBUST_SCALE))
-    strength = sigma / 8**0.5 if settings.loss == "l1" else sigma**2
+    strength = (sigma / 8**0.5 if settings.loss == "l1" else sigma**2) * relative_weight(settings, scale)
     chosen = replace(PAPER, temporal=strength, spatial=0.0, robust_scale=scale)
+    scale = scale if settings.robust_scale is None else settings.robust_scale
     return chosen, (
         f"λ1 = {strength:.2g} weighs the Gaussian prior against noise of {sigma:.2g} RMS radii; the loss turns linear at "
         f"{scale:.2g} RMS radii."
     )
+
+
+def relative_weight(settings: Settings, scale: float) -> float:
+    """Return the weight of small residuals with the given robust scale relative to that with `scale`, at most 1.
+
+    A scale ε of L1 above the noise makes the loss r²/2ε, and a scale δ of Huber below it 2δ|r|: with the same λ1, the prior would outweigh
+    the observations.
+    """
+    if settings.robust_scale is None or settings.loss == "l2":
+        return 1.0
+    wider = settings.robust_scale / scale
+    return min(1.0, wider if settings.loss == "huber" else 1 / wider)
 
 
 def bending_weight(temporal: float, laplacian: Laplacian, shapes: NDArray[np.floating], modes: int) -> float:
@@ -160,9 +173,11 @@ def _from_data(rough: Roughness, settings: Settings) -> tuple[Weights, str]:
         return _least_squares(rough, spoiled=spoiled)
     scale = float(np.clip(rough.noise_std, *ROBUST_SCALE_RANGE))
     stiff = STIFFEST if spoiled else float(np.clip(STIFFNESS / max(rough.noise_std, 1e-9), SOFTEST, STIFFEST))
+    stiff *= relative_weight(settings, scale)
     chosen = replace(
         PAPER, temporal=stiff, spatial=stiff * SPATIAL_SHARE, low_rank=stiff * LOW_RANK_SHARE, robust_scale=scale
     )
+    scale = scale if settings.robust_scale is None else settings.robust_scale
     why = (
         "gross outliers must be resisted" if spoiled else f"frame-to-frame roughness is {rough.noise_std:.2g} RMS radii"
     )

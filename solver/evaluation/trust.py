@@ -46,6 +46,11 @@ LOOSE_HELD_OUT, LOST_HELD_OUT = 0.08, 0.25
 """Median distance of held-out observations from their prediction, relative to the size, for the same two verdicts. White noise, which is
 fitted to .04, has .7; tracks with noise of 2 % of the largest coordinate .03 to .07; ten face scans with 10 % outliers, 30 % hidden .08."""
 
+OUTWEIGHED = 3.0
+"""Median distance of observations from the projected shapes, in standard deviations of the noise, above which given weights let the priors
+outweigh the tracks; Gaussian noise has 1.2. A face of 20 × 200, clean and with noise: 2.5 and less where the error is inside its interval,
+3.3 and more where it is above."""
+
 FLEXIBLE = 0.5
 """Modes of deformation per frame above which the motion hardly determines depth: one independent shape every second frame."""
 
@@ -139,6 +144,7 @@ def assess(
     depth_is_typical: bool,
     shown: NDArray[np.bool_],
     unclear_camera: str | None,
+    given_weights: bool = False,
 ) -> Trust:
     """Return the verdict on a solution.
 
@@ -162,6 +168,8 @@ def assess(
         Frames that show enough points for a camera of their own.
     unclear_camera : str or None
         Sentence that states why the camera model is in doubt; None if it is not.
+    given_weights : bool
+        Whether the user gave a weight of the priors, which the standard deviations do not count.
     """
     shapes, rotations, shapes_std = solution.shapes, solution.camera.rotations, solution.shapes_std
     size = size_of(shapes)
@@ -169,7 +177,8 @@ def assess(
     expected = None if shapes_std is None else float(np.sqrt(np.square(shapes_std).mean())) / size
     residual, hidden = _fit(solution, visible, size)
     turn = turned(rotations[shown])
-    bounded = not (planar or depth_is_typical or turn < NARROW)
+    outweighed = given_weights and expected is not None and residual * size > OUTWEIGHED * solution.choices.noise
+    bounded = not (planar or depth_is_typical or turn < NARROW or outweighed)
     turning, deforming = per_frame(shapes, rotations) if ordered else (None, None)
     found = [
         *_observation_signs(residual, hidden),
@@ -186,6 +195,8 @@ def assess(
             modes, len(shapes), off=off_plane(shapes) if planar else None, turn=turn if depth_is_typical else None
         ),
     ]
+    if outweighed:
+        found.append((Verdict.WITH_CARE, _outweighed(residual)))
     if unclear_camera is not None:
         found.append((Verdict.WITH_CARE, unclear_camera))
     verdict, reasons = _most_serious_first(found)
@@ -210,6 +221,13 @@ def assess_isometric(solution: Solution, *, ordered: bool) -> Trust:
         verdict, reasons, None, None, turned(rotations), residual, hidden,
         degrees_per_frame=turning, deformation_per_frame=deforming, depth_from_lengths=True,
     )  # fmt: skip
+
+
+def _outweighed(residual: float) -> str:
+    return (
+        f"With the given weights, the shapes miss the tracks by {_percent(residual)} of the object's size, more than "
+        f"{OUTWEIGHED:.0f} times the noise: the priors outweigh the tracks. Lower temporal_weight and spatial_weight, or leave them out."
+    )
 
 
 def frames_behind(camera: Camera, shapes: Floats) -> NDArray[np.bool_]:

@@ -19,7 +19,7 @@ GRAZING = 0.05
 """Minimum sine of the angle between a visible vertex's surface and the viewing direction."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Sequence:
     """A synthetic sequence: `tracks = scales · shapes · rotations[:, :2]ᵀ + translation` exactly, unless corrupted."""
 
@@ -43,6 +43,9 @@ class Sequence:
 
     outliers: NDArray[np.bool_]
     """Mask of the observations that `corrupt` replaced by outliers, `(F, P)`."""
+
+    def __repr__(self) -> str:
+        return f"<Sequence {self.name}: {self.tracks}>"
 
 
 def sweep(num_frames: int, degrees: float, *, tilt: float) -> Floats:

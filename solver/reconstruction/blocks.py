@@ -66,7 +66,7 @@ def shapes_in_blocks(
     scratch: str | Path | None,
 ) -> Solution:
     """Return the solution of all points; `seconds` is the time per stage so far, `start` and `scratch` are as for `solve_shapes`."""
-    began, whole = time.perf_counter(), _Whole(tracks, cameras, prior, scratch)
+    began, whole = time.perf_counter(), _Whole(tracks, cameras, prior, settings, scratch)
     groups = blocks(tracks, -(-tracks.num_frames * tracks.num_points // BLOCK_OBSERVATIONS))
     edges = np.zeros((0, 2), dtype=np.int32) if mesh is None else mesh.edges
     pulse()
@@ -179,9 +179,12 @@ def _monitor_of(part: Tracks, settings: Settings, monitor: Monitor, number: int,
 class _Whole:
     """The result, filled block by block."""
 
-    def __init__(self, tracks: Tracks, cameras: Cameras, prior: Prior | None, scratch: str | Path | None) -> None:
+    def __init__(
+        self, tracks: Tracks, cameras: Cameras, prior: Prior | None, settings: Settings, scratch: str | Path | None
+    ) -> None:
         frames, points = tracks.num_frames, tracks.num_points
         self._tracks, self._cameras, self._prior, self._scratch = tracks, cameras, prior, scratch
+        self._given_weights = settings.gives_weights
         self._shapes = allocated((frames, points, 3), scratch)
         self._others: dict[str, Floats] = {}
         self._seen = self._rejected = 0
@@ -259,7 +262,7 @@ class _Whole:
         return judged(
             few, tracks, confidence, self._cameras.estimate if prior is None else estimate_with(self._cameras, prior),
             None if prior is None else prior.normalized, self._cameras.observations.normalized.unit,
-            held_out_error=float(np.median(left_out)) if left_out else None,
+            held_out_error=float(np.median(left_out)) if left_out else None, given_weights=self._given_weights,
         )  # fmt: skip
 
 

@@ -139,7 +139,7 @@ def _finished(
         solution, tracks, confidence, estimate, covariance, normalized.unit,
         turning=observations.turning, free_scales=observations.known_scales is None,
         seed=start.settings.seed, connected=start.part is not None or problem.weights.spatial > 0, changes=changes,
-        centred=problem.moving, should_stop=monitor,
+        centred=problem.moving, given_weights=start.settings.gives_weights, should_stop=monitor,
     )  # fmt: skip
     return replace(solution, outcome=Outcome.STOPPED) if monitor.stopped else solution
 

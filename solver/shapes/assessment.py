@@ -46,6 +46,7 @@ def assessed(
     connected: bool,
     changes: Changes | None,
     centred: bool,
+    given_weights: bool,
     should_stop: ShouldStop,
 ) -> Solution:
     """Return the solution with the standard deviations of its positions and the verdict on it.
@@ -76,6 +77,8 @@ def assessed(
         Jackknife result for these cameras and this covariance; None computes it.
     centred : bool
         Whether the shapes contain all points of the object, so that their mean is its centre. Otherwise the centre is the origin.
+    given_weights : bool
+        Whether the user gave a weight of the priors.
     should_stop : callable
         Called between units of work; once it returns True, the jackknife is skipped.
     """
@@ -106,7 +109,9 @@ def assessed(
         held_out = held_out_error(tracks, solution.shapes, solution.camera, confidence, covariance, unit=unit)
     should_stop()
     solution = replace(solution, shapes_std=std)
-    trust = judged(solution, tracks, confidence, estimate, covariance, unit, held_out_error=held_out)
+    trust = judged(
+        solution, tracks, confidence, estimate, covariance, unit, held_out_error=held_out, given_weights=given_weights
+    )
     return replace(solution, trust=trust)
 
 
@@ -139,6 +144,7 @@ def judged(
     unit: float,
     *,
     held_out_error: float | None,
+    given_weights: bool,
 ) -> Trust:
     """Return the verdict on a solution with standard deviations; arguments as for `assessed`."""
     return assess(
@@ -151,6 +157,7 @@ def judged(
         depth_is_typical=estimate.depth_is_typical,
         shown=informative_frames(confidence),
         unclear_camera=_unclear_camera(estimate.perspective, unit),
+        given_weights=given_weights,
     )
 
 

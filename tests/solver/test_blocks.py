@@ -153,7 +153,7 @@ def test_verdict_and_outlier_share_in_blocks_match_solving_at_once(film: gallery
 @pytest.mark.usefixtures("limited")
 def test_choices_of_blocks_are_reported_as_medians_with_all_warnings(film: gallery.Sequence) -> None:
     solution = solve(film.tracks, film.mesh, cameras=given(film), settings=Settings(prior="smooth", max_reweightings=2))
-    whole = blocks._Whole(film.tracks, estimate_cameras(film.tracks, given(film)), None, None)
+    whole = blocks._Whole(film.tracks, estimate_cameras(film.tracks, given(film)), None, Settings(), None)
     kept = np.arange(POINTS)
     for weight, warning in ((1.0, "one"), (3.0, "two"), (9.0, "one")):
         reasons = dict(solution.choices.reasons, few=warning) | ({"late": "late"} if weight == 9 else {})

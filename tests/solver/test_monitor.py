@@ -466,3 +466,13 @@ def test_the_plan_of_a_long_film_has_fewer_learned_frames_and_an_extension() -> 
     )
     assert film.keys() - photographs.keys() == {"extension"}
     assert film["refinement"] < 0.6 * photographs["refinement"]
+
+
+def test_the_plan_counts_the_factorization_of_all_frames_without_a_learned_prior() -> None:
+    short, long = (
+        {stage.name: stage.seconds for stage in planned(frames, 300, gaussian=False, known_cameras=False, sheet=False)}
+        for frames in (300, 3000)
+    )
+    assert long["factorization"] == pytest.approx(100 * short["factorization"])
+    assert long["factorization"] > 10
+    assert long["completion"] > 2  # with the Gram matrix

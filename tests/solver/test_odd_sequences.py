@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pliant.solver import InvalidInput, KnownCamera, Mesh, Outcome, Settings, Solution, Tracks, gallery, solve
+from pliant.solver.agreement import separate_points_warnings, shared_position_warnings
 from pliant.solver.cameras.planar_ambiguity import poses
 from pliant.solver.cameras.scale import rigid_scales
 from pliant.solver.model.marginal_likelihood import LOWER, root_of
@@ -187,3 +188,49 @@ def test_hidden_frames_get_finite_poses_and_scales() -> None:
     assert np.isfinite(scales).all()
     assert scales.min() > 0
     assert all(np.isfinite(each).all() for each in poses(gram))
+
+
+@pytest.mark.parametrize("marker", [-1.0, 0.0])
+def test_a_position_that_marks_hidden_points_is_named(marker: float) -> None:
+    film = gallery.face(12, 60)
+    hidden = np.random.default_rng(0).random((12, 60)) < 0.1
+    points = np.where(hidden[..., None], marker, film.tracks.points)
+    given = Settings(method="pseudo_inverse")
+    cameras = KnownCamera.from_arrays(film.rotations)
+    (warning,) = solve(Tracks.from_arrays(points), cameras=cameras, settings=given).choices.warnings
+    assert warning.startswith(f"{hidden.mean():.0%} of the visible positions are exactly ({marker:g}, {marker:g})")
+    assert solve(Tracks.from_arrays(points, ~hidden), cameras=cameras, settings=given).choices.warnings == ()
+
+
+def test_positions_that_few_points_share_are_no_markers() -> None:
+    still = gallery.face(12, 60).tracks.points.copy()
+    still[:, :2] = 5.0  # two points that do not move
+    assert shared_position_warnings(Tracks.from_arrays(still)) == ()
+    still[:, 2] = 5.0
+    assert len(shared_position_warnings(Tracks.from_arrays(still))) == 1
+    assert shared_position_warnings(Tracks.from_arrays(np.round(gallery.face(60, 900).tracks.points))) == ()
+
+
+def test_points_that_no_chain_of_frames_connects_are_named() -> None:
+    points = np.random.default_rng(0).random((30, 60, 2))
+    visible = np.zeros((30, 60), dtype=bool)
+    visible[:10, :20] = visible[10:20, 20:40] = visible[20:, 40:] = True
+    assert "connects 40 of the points" in separate_points_warnings(Tracks.from_arrays(points, visible))[0]
+    visible[9, 20] = visible[20, 39] = True
+    assert separate_points_warnings(Tracks.from_arrays(points, visible)) == ()
+    few = np.ones((30, 60), dtype=bool)
+    few[5:, :3], few[:5, 3:] = False, False  # three points are too few for a part of their own
+    assert separate_points_warnings(Tracks.from_arrays(points, few)) == ()
+    once = np.ones((30, 60), dtype=bool)
+    once[1:, :20], once[0, 20:] = False, False  # and so is one frame
+    assert separate_points_warnings(Tracks.from_arrays(points, once)) == ()
+
+
+def test_the_solution_warns_about_points_that_no_frame_connects() -> None:
+    film = gallery.face(12, 60)
+    visible = np.ones((12, 60), dtype=bool)
+    visible[6:, :30] = visible[:6, 30:] = False
+    cameras = KnownCamera.from_arrays(film.rotations)
+    tracks = Tracks.from_arrays(film.tracks.points, visible)
+    (warning,) = solve(tracks, cameras=cameras, settings=Settings(method="pseudo_inverse")).choices.warnings
+    assert warning.startswith("No frame connects 30 of the points")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pliant.solver import InvalidInput, KnownCamera, Mesh, Outcome, Settings, Tracks
+from pliant.solver import InvalidInput, KnownCamera, Mesh, Outcome, Settings, Tracks, gallery
 from pliant.solver.errors import InvalidSettings
 
 POINTS = np.arange(5 * 6 * 2, dtype=float).reshape(5, 6, 2)
@@ -275,3 +275,14 @@ def test_an_array_that_is_no_pair_is_refused_in_words(wrong: Any) -> None:
 def test_every_outcome_has_a_sentence() -> None:
     assert all(outcome.sentence.endswith(".") for outcome in Outcome)
     assert "a tolerance above the rounding errors" in Outcome.REJECTED.sentence
+
+
+def test_records_are_shown_without_their_arrays() -> None:
+    film = gallery.face(5, 20)
+    assert repr(film) == "<Sequence face: <Tracks of shape (5, 20, 2)>>"
+    assert repr(film.mesh) == f"<Mesh of 20 points, faces of shape {film.mesh.faces.shape}>"
+    assert repr(KnownCamera.from_arrays(film.rotations, focal=500)) == (
+        "<KnownCamera of 5 frames, scales estimated, focal length 500>"
+    )
+    assert repr(KnownCamera.from_arrays(film.rotations, film.scales)) == "<KnownCamera of 5 frames, scales given>"
+    assert repr(Tracks(None, None)) == "<Tracks of shape ()>"  # type: ignore[arg-type]

@@ -1,7 +1,8 @@
 """Estimate a job's memory and time from its size before it runs.
 
-Memory is a constant for the interpreter and the libraries plus an amount per observation (F·P), since every array of the solver and of the
-exporters is linear in them. Time is a constant plus an amount per frame, for cameras and prior, and an amount per observation.
+Memory is a constant for the interpreter and the libraries plus an amount per observation (F·P), since the arrays of the solver and of the
+exporters are linear in them; but where the prior is not learned, cameras are factorized from the Gram matrix of all frames. Time is a
+constant plus an amount per frame, for cameras and prior, and an amount per observation.
 
 Basis: whole jobs with the default options and outputs on one core, gallery faces (`python -m benchmarks.installation.cost`), with both
 cores of the machine busy; in a quiet hour 100 × 500 took 12.4 s.
@@ -24,6 +25,10 @@ With other options, the solver alone, processor s (estimate); the constants were
     10 × 500              .7 (1.0)          .5 (1.0)
     100 × 500            5.2 (5.4)         4.4 (5.4)
     30 × 5,000           2.1 (3.1)         2.2 (3.1)   .8 (1.9)
+    1,000 × 300           15 (19)
+    3,000 × 300           47 (46)                      30 (36)
+
+3,000 × 300 took 1.1 GB with the smooth prior (estimate 1.2), .3 GB with given scales, too.
 
 With `image_size`, the solver alone, processor s, noise of .5 px (`python -m benchmarks.installation.cost --near`, in the same hour):
 
@@ -40,6 +45,8 @@ Not covered: sparsely observed points, which take 80 bytes times the square of t
 """
 
 from __future__ import annotations
+
+from bisect import bisect_right
 
 from pliant.schemas.job import Estimate
 from pliant.schemas.options import Options
@@ -61,6 +68,12 @@ SECONDS = 0.5
 LEARNING = {(True, False): 0.2, (True, True): 0.045, (False, False): 0.045, (False, True): 0.005}
 """Processor seconds per frame from which cameras and prior are learned, by (whether the prior is learned, whether rotations are given)."""
 
+FURTHER = 0.01
+"""Processor seconds per frame that cameras and prior are not learned from, where the prior is not learned."""
+
+GRAM_BYTES = 96
+"""Bytes per squared number of frames, where the prior is not learned: the Gram matrix of the tracks, shape `(2F, 2F)`, and two copies."""
+
 LENS, LENS_FRAMES = 7.0, 32
 """Processor seconds of comparing focal lengths where picture size or lens is known, and the number of frames from which they are compared;
 fewer take proportionally less."""
@@ -79,19 +92,20 @@ def estimated(num_frames: int, num_points: int, options: Options, *, has_rotatio
     learning = LEARNING[learns, has_rotations] * used
     if learns and _may_be_perspective(options):
         learning += LENS * min(1.0, used / LENS_FRAMES)
+    if not learns:
+        learning += FURTHER * (num_frames - used)
+    gram = 0 if learns else GRAM_BYTES * num_frames**2
     return Estimate(
-        memory_bytes=LIBRARIES + BYTES[prior] * at_once + BEYOND * (observations - at_once),
+        memory_bytes=LIBRARIES + BYTES[prior] * at_once + BEYOND * (observations - at_once) + gram,
         seconds=round(SECONDS + learning + MICROSECONDS * 1e-6 * observations, 1),
     )
 
 
 def largest_that_fits(memory: int, num_frames: int, num_points: int, options: Options) -> tuple[int, int]:
     """Return the most points at this number of frames, and the most frames at this number of points, that fit into `memory` bytes."""
-    left, each, block = max(0, memory - LIBRARIES), BYTES[_prior(options)], _largest_block(options)
-    observations = left // each
-    if observations > block:
-        observations = int(block + (left - each * block) // BEYOND)
-    return observations // max(1, num_frames), observations // max(1, num_points)
+    sizes = range(1, memory // BEYOND + 2)  # one more observation than any estimate allows
+    points = bisect_right(sizes, memory, key=lambda count: estimated(num_frames, count, options).memory_bytes)
+    return points, bisect_right(sizes, memory, key=lambda count: estimated(count, num_points, options).memory_bytes)
 
 
 def _prior(options: Options) -> str:

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, KnownCamera, Mesh, Tracks
-from pliant.solver.agreement import check_agreement, check_principal_point, check_seen
+from pliant.solver.agreement import (
+    check_agreement,
+    check_focal,
+    check_principal_point,
+    check_seen,
+    separate_points_warnings,
+    shared_position_warnings,
+)
 from pliant.solver.limits import MAX_COORDINATE
 from pliant.solver.tracks.normalization import normalize
 from pliant.worker.formats.cost import estimated
@@ -66,7 +73,8 @@ def read_inputs(
     notes = [
         *notes_on_options(options, film=False), *understood.notes,
         *unused_arrays(tracks, understood, has_mesh=mesh is not None, has_truth=truth is not None),
-        *chosen.notes, *truth_notes,
+        *chosen.notes, *truth_notes, *shared_position_warnings(chosen.tracks),
+        *separate_points_warnings(chosen.tracks),
     ]  # fmt: skip
     interpretation = _interpretation(
         understood, chosen, film, notes, has_truth=truth is not None, has_rotations=cameras is not None
@@ -108,8 +116,11 @@ def check_options(
     """
     settings = solver_settings(options, y_up=y_axis == "up")
     check_agreement(tracks, mesh, cameras, settings)
+    if settings.principal_point is None and settings.focal_length is None:
+        return
+    normalized = normalize(tracks)
+    check_focal(normalized.unit, settings)
     if settings.principal_point is not None:
-        normalized = normalize(tracks)
         check_principal_point(normalized.centroid, normalized.unit, np.array(settings.principal_point))
 
 

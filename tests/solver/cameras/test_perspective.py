@@ -353,7 +353,34 @@ def test_a_distant_principal_point_is_rejected() -> None:
     tracks = pinhole(SEEN, FOCAL)
     with pytest.raises(InvalidInput) as refused:
         given_lens(normalize(tracks), Settings(principal_point=(1e7, 0.0)))
-    assert refused.value.code == "principal_point_far"
+    assert (refused.value.code, refused.value.field) == ("principal_point_far", "options.principal_point")
+
+
+def test_fractions_of_the_picture_with_its_size_in_pixels_are_rejected() -> None:
+    tracks = pinhole(SEEN, FOCAL)
+    fractions = Tracks.from_arrays(tracks.points / np.array(PICTURE), tracks.visible)
+    with pytest.raises(InvalidInput, match="tracks that are fractions") as refused:
+        given_lens(normalize(fractions), Settings(image_size=PICTURE))
+    assert (refused.value.code, refused.value.field) == ("principal_point_far", "options.image_size")
+
+
+def test_a_focal_length_in_millimetres_is_refused() -> None:
+    tracks = pinhole(SEEN, FOCAL)
+    normalized = normalize(tracks)
+    wide = {"field_of_view": 179.0, "image_size": PICTURE}
+    known = KnownCamera.from_arrays(FACE.rotations, focal=4.2)
+    for settings, cameras, field in (
+        (Settings(focal=4.2), None, "options.focal"),
+        (Settings(**wide), None, "options.field_of_view"),
+        (Settings(), known, "cameras.focal"),
+    ):
+        with pytest.raises(InvalidSettings, match="not in millimetres") as refused:
+            given_lens(normalized, settings, cameras)
+        assert refused.value.field == field
+    with pytest.raises(InvalidSettings, match="not in millimetres"):
+        Settings(focal=24, image_size=PICTURE)
+    assert given_lens(normalized, Settings(focal=normalized.unit / 3.7)) is not None
+    assert Settings(focal=PICTURE[0] / 7.4, image_size=PICTURE).focal is not None
 
 
 def test_different_focal_lengths_in_cameras_and_settings_are_rejected() -> None:

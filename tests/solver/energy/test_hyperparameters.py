@@ -95,3 +95,13 @@ def test_jumps_are_distinguished_from_motion(face: gallery.Sequence) -> None:
     assert roughness_of(normalize(face.tracks)).jumps < 0.01
     spoiled = gallery.corrupt(face, outliers=0.05, seed=3).tracks
     assert 0.1 < roughness_of(normalize(spoiled)).jumps < 0.3
+
+
+@pytest.mark.parametrize(("loss", "scale"), [("l1", 1e3), ("huber", 1e-9)])
+@pytest.mark.parametrize("prior", ["gaussian", "smooth"])
+def test_a_given_robust_scale_does_not_let_the_prior_outweigh_the_tracks(
+    face: gallery.Sequence, prior: str, loss: str, scale: float
+) -> None:
+    chosen = solved(face, face.tracks, prior=prior, loss=loss, robust_scale=scale)
+    assert metrics.e3d_frame(chosen.shapes, face.shapes) < 1.2 * error(face, face.tracks, prior=prior, loss=loss)
+    assert f"turns linear at {scale:.2g} RMS radii" in chosen.choices.reasons["weights"]

@@ -259,3 +259,22 @@ def test_a_prior_of_weight_zero_gives_no_expected_error() -> None:
     assert found.shapes_std is None
     assert found.trust is not None
     assert found.trust.expected_error is None
+
+
+def test_given_weights_that_outweigh_the_tracks_need_care() -> None:
+    close, far = np.full((FRAMES, POINTS), 0.02), np.full((FRAMES, POINTS), 0.04)  # noise .01
+    assert judged(residuals=far).verdict is Verdict.GOOD
+    assert judged(residuals=close, given_weights=True).verdict is Verdict.GOOD
+    trust = judged(residuals=far, given_weights=True)
+    assert (trust.verdict, trust.interval) == (Verdict.WITH_CARE, None)
+    assert "more than 3 times the noise" in trust.reasons[0]
+    assert judged(residuals=far, given_weights=True, shapes_std=None).verdict is Verdict.GOOD
+
+
+@pytest.mark.parametrize("weight", ["temporal_weight", "spatial_weight"])
+def test_the_solver_says_where_a_given_weight_outweighs_the_tracks(weight: str) -> None:
+    film = gallery.face(12, 100)
+    cameras = KnownCamera.from_arrays(film.rotations, film.scales)
+    trust = solve(film.tracks, film.mesh, cameras=cameras, settings=Settings(**{weight: 10.0})).trust  # type: ignore[arg-type]
+    assert trust is not None
+    assert any("the priors outweigh the tracks" in reason for reason in trust.reasons)

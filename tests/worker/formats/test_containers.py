@@ -72,6 +72,12 @@ def test_a_table_of_numpy_savetxt_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(tmp_path / "t.csv").tracks.points, POINTS)
 
 
+def test_points_of_a_csv_may_have_large_numbers() -> None:
+    rows = [f"{frame},{10**10 * point},{frame},{point}" for frame in range(4) for point in range(3)]
+    content = "\n".join(["frame,point,x,y", *rows]).encode()
+    assert read_csv(io.BytesIO(content), field="tracks", limits=Limits())["tracks"].shape == (4, 3, 2)
+
+
 @forked
 def test_csv_lines_may_come_in_any_order_and_missing_ones_are_hidden(tmp_path: Path) -> None:
     lines = [f"{f},{p + 7},{x!r},{y!r}" for f in range(F) for p, (x, y) in enumerate(POINTS[f].tolist())]

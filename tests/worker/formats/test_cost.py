@@ -29,3 +29,12 @@ def test_films_are_learned_from_every_nth_frame_and_photographs_from_all() -> No
     film, photographs = (estimated(300, 1, Options(order=order)).seconds for order in ("film", "any"))
     assert film == estimated(150, 1, Options(order="film")).seconds
     assert photographs == pytest.approx(SECONDS + 300 * LEARNING[True, False], abs=0.1)
+
+
+def test_the_smooth_prior_counts_the_gram_matrix_of_all_frames() -> None:
+    long = estimated(3000, 300, Options(prior="smooth"))
+    assert 1.1e9 / 1.5 < long.memory_bytes < 1.5 * 1.1e9  # 1.1 GB and 47 s were measured
+    assert 47 / 1.5 < long.seconds < 1.5 * 47
+    points, frames = largest_that_fits(10**9, 3000, 300, Options(prior="smooth"))
+    assert 0 < points < 300
+    assert 2000 < frames < 3000

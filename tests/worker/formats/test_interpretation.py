@@ -80,6 +80,7 @@ def test_y_before_x_is_detected_by_the_image_size(tmp_path: Path) -> None:
     [
         ("outside_picture", "image_size", {"image_size": "3x2"}),
         ("principal_point_far", "principal_point", {"principal_point": "1000000,0"}),
+        ("invalid_option", "focal", {"focal": 0.5}),
         ("invalid_option", "laplacian", {"laplacian": "grid8"}),
         ("invalid_option", "surface", {"surface": "isometric"}),
         ("invalid_option", "focal", {"focal": 900, "camera": "orthographic"}),

@@ -394,7 +394,8 @@ def test_refusals_state_what_was_found_and_what_to_do(case: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("part", "kinds"), [("mesh", "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"), ("ground_truth", FILES)]
+    ("part", "kinds"),
+    [("mesh", "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"), ("ground_truth", "npz, npy or MATLAB .mat")],
 )
 def test_a_spreadsheet_as_mesh_or_truth_is_refused(part: str, kinds: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "tracks.npz", tracks=POINTS)
@@ -404,6 +405,20 @@ def test_a_spreadsheet_as_mesh_or_truth_is_refused(part: str, kinds: str, tmp_pa
     assert str(caught.value) == (
         f"{part}: expected {kinds}, recognised by content, got a spreadsheet (xlsx). Write the arrays with numpy.savez."
     )
+
+
+@pytest.mark.parametrize("part", ["ground_truth", "rotations"])
+@pytest.mark.parametrize("text", ["frame,point,x,y,z\n0,0,1,2,3\n", "frame,r11,r12\n0,1,0\n"])
+def test_tables_of_true_shapes_and_rotations_are_refused_with_the_files_that_are_read(
+    part: str, text: str, tmp_path: Path
+) -> None:
+    np.savez(tmp_path / "tracks.npz", tracks=POINTS)
+    (tmp_path / "table.csv").write_text(text)
+    files = {"tracks": tmp_path / "tracks.npz", "mesh": "none", part: tmp_path / "table.csv"}
+    with pytest.raises(InvalidInput) as caught:
+        read_inputs(**files, options=Options())
+    assert (caught.value.code, caught.value.field) == ("unknown_format", part)
+    assert caught.value.expected == "npz, npy or MATLAB .mat, recognised by content"
 
 
 def test_an_hdf5_table_without_deeplabcut_columns_is_refused(tmp_path: Path) -> None:

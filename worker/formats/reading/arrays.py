@@ -40,7 +40,10 @@ UNREADABLE_ZIP = (
 
 TRACK_FILES = "npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe exports"
 MESH_FILES = "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"
-"""Supported files, as named in error messages."""
+ARRAY_FILES = "npz, npy or MATLAB .mat"
+"""Supported files of tracks, of meshes, and of true shapes and rotations, as named in error messages."""
+
+FILES = {"tracks": TRACK_FILES, "mesh": MESH_FILES}
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 """Names of pictures. Not all of these formats are accepted as a film."""
@@ -218,7 +221,7 @@ def film_as_tracks(got: str) -> InvalidInput:
 
 def spreadsheet_refusal(field: str, got: str) -> InvalidInput:
     """Return the error for a spreadsheet program's own file, with a hint on how to save it."""
-    kinds = MESH_FILES if field == "mesh" else TRACK_FILES
+    kinds = FILES.get(field, ARRAY_FILES)
     hint = (
         f"Save it as CSV in the spreadsheet program. {EXAMPLE}"
         if field == "tracks"

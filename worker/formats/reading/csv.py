@@ -33,6 +33,8 @@ codecs.lookup("utf-16")  # imports the decoder now: a contained process cannot o
 COLUMNS = ("frame", "point", "x", "y")
 POINT_NAMES = ("point", "track_id", "id")
 """Names of the column with the number of the point; the first that a table has counts."""
+MAX_NUMBER = 2**53
+"""Largest number of a frame or point: larger ones are not exact as float64."""
 WIDE = 8
 """Number of columns from which a table without names is rejected: its rows may be frames, and its columns could mean anything."""
 
@@ -92,8 +94,12 @@ def _observations(columns: list[str], rows: list[list[float]], *, field: str, li
     if len(table) == 0:
         raise damaged(field, "no observations below the names of the columns")
     numbers = table[:, [index["frame"], index["point"]]]
-    if not np.isfinite(numbers).all() or (numbers != np.rint(numbers)).any() or np.abs(numbers).max() > 2**31:
-        raise damaged(field, "frames or points that are not whole numbers")
+    wrong = numbers[~((numbers == np.rint(numbers)) & (np.abs(numbers) <= MAX_NUMBER))]
+    if len(wrong):
+        raise InvalidInput(
+            "damaged_file", field=field, expected="whole numbers in the columns frame and point", got=f"{wrong[0]:g}",
+            hint="Number frames and points, as in 0, 1, 2.",
+        )  # fmt: skip
     frames = (numbers[:, 0] - numbers[:, 0].min()).astype(np.int64)
     names, points = np.unique(numbers[:, 1].astype(np.int64), return_inverse=True)
     count = int(frames.max()) + 1

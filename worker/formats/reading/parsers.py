@@ -11,8 +11,8 @@ from typing import IO
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.reading.arrays import (
-    MESH_FILES,
-    TRACK_FILES,
+    ARRAY_FILES,
+    FILES,
     film_as_tracks,
     pickle_refusal,
     spreadsheet_refusal,
@@ -96,9 +96,7 @@ def recognise(head: bytes, field: str) -> str:
             return "gltf" if head.lstrip().startswith(b"{") else "obj"
         if field == "tracks" and head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith((b"[", b"{")):
             return "json"
-        if looks_like_csv(head):
-            return "csv"
-    if head.startswith(UTF_16) and field != "mesh" and looks_like_csv(head):
+    if field == "tracks" and (_is_text(head) or head.startswith(UTF_16)) and looks_like_csv(head):
         return "csv"
     raise unknown_format(field, head)
 
@@ -119,7 +117,7 @@ def unknown_format(field: str, head: bytes) -> InvalidInput:
     """Return the error for a file of an unknown format."""
     if head.startswith(OFFICE):
         return spreadsheet_refusal(field, DOCUMENTS[OFFICE])
-    kinds, example = MESH_FILES if field == "mesh" else TRACK_FILES, EXAMPLES.get(field, EXAMPLES["tracks"])
+    kinds, example = FILES.get(field, ARRAY_FILES), EXAMPLES.get(field, EXAMPLES["tracks"])
     matlab = _matlab_kind(head)
     hint = f"Convert it, e.g. {example}."
     if matlab is not None and field != "mesh":
