@@ -65,6 +65,7 @@ class Monitor:
         self._on_step, self._should_stop, self._clock = on_step, should_stop, clock
         self._last = Step("cameras", 0.0)
         self._ahead = list(plan[1:])
+        self._unlikely: list[Stage] = []
         self._began = self._reported = clock()
         self._units, self._share = 0, 0.0  # of the current stage
         self._done = 0.0  # planned seconds of all work before it
@@ -97,6 +98,8 @@ class Monitor:
         units : int, optional
             Expected units of work, replacing the planned number.
         """
+        if any(stage.name == name for stage in self._unlikely):
+            self._ahead, self._unlikely = self._unlikely, []
         place = self._place(name)
         if place is None:
             return
@@ -115,6 +118,10 @@ class Monitor:
         place = self._place(before)
         place = len(self._ahead) if place is None else place
         self._ahead[place:place] = stages
+
+    def expect_only(self, stages: Sequence[Stage]) -> None:
+        """Replace the stages ahead, which probably do not run, until one of them begins."""
+        self._ahead, self._unlikely = list(stages), self._ahead
 
     def report(self, step: Step) -> None:
         """Report a step with the present fraction and remaining time; a fraction of 1 is kept."""
@@ -153,6 +160,12 @@ def enter(should_stop: Callable[[], bool] | None, name: str, *, units: int | Non
     """Begin a stage if `should_stop` is a `Monitor`; otherwise do nothing."""
     if isinstance(should_stop, Monitor):
         should_stop.enter(name, units=units)
+
+
+def expect_only(should_stop: Callable[[], bool] | None, stages: Sequence[Stage]) -> None:
+    """Plan only these stages ahead if `should_stop` is a `Monitor`; otherwise do nothing."""
+    if isinstance(should_stop, Monitor):
+        should_stop.expect_only(stages)
 
 
 def _filled(units: int, stage: Stage) -> float:

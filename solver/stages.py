@@ -47,6 +47,15 @@ FIRST_LOOK_UNITS, ANCHORS_SECONDS = 13, 0.01
 """Of more frames, the units of work before their anchors are chosen, and the seconds of choosing them per frame: .004 with 300 points, .01
 with 2,000 and 8,000, each in 100, 300 and 600 frames."""
 
+SHEET_SECONDS, SHEET_UNITS = 2.0, 60
+"""An accepted sheet: seconds and units of solving the frames of the search again."""
+
+SHEET_FRAME_SECONDS, SHEET_FRAMES_UNITS = 0.055, 60
+"""Then in all of more frames: seconds per frame, and units. Measured for 60 to 3,000 frames of paper."""
+
+SHEET_POINT_SECONDS = 4e-6
+"""And in all points: seconds per frame and point, measured for 20 and 150 frames of 10,000 points."""
+
 COMPLETION_SECONDS, MOST_COMPLETED, RANK_GROWTH = 8e-7, (60, 600), 2.0
 """Completion of hidden positions: seconds per squared frame count and point; the numbers of frames and of points above which the time no
 longer grows, because the ranks tried end at 40; and the ratio of the times of consecutive ranks."""
@@ -168,6 +177,14 @@ def search_for_sheet(frames: int) -> list[Stage]:
     later = SURFACE_UNITS - FIRST_LOOK_UNITS
     look = Stage("first_look", (FIRST_LOOK_UNITS + SURFACE_SETUP) * each, FIRST_LOOK_UNITS, setup=SURFACE_SETUP)
     return [look, Stage("anchors", ANCHORS_SECONDS * frames, 1), Stage("surface", later * each, later)]
+
+
+def accepted_sheet(frames: int, points: int) -> list[Stage]:
+    """Return the stages that remain once the tracks are found to be those of an isometric surface."""
+    stages = [Stage("sheet", SHEET_SECONDS * min(frames / SURFACE_FRAMES, 1.0), SHEET_UNITS)]
+    if frames > SURFACE_FRAMES:
+        stages.append(Stage("sheet_frames", SHEET_FRAME_SECONDS * frames, SHEET_FRAMES_UNITS))
+    return [*stages, Stage("sheet_points", SHEET_POINT_SECONDS * frames * points, 1)]
 
 
 def unseen_frames(visible: Floats) -> float:

@@ -22,9 +22,10 @@ from pliant.solver.isometry.homographies import off_homography
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import refine
 from pliant.solver.isometry.restarts import carried, refine_with_restarts, unlikeness
-from pliant.solver.monitor import enter
+from pliant.solver.monitor import enter, expect_only
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, Tracks
+from pliant.solver.stages import accepted_sheet
 from pliant.solver.tracks.normalization import relative
 
 ANCHORS = 60
@@ -183,6 +184,8 @@ def _verdict(
     warnings = _warnings(None if supported else why, focal, least, chosen)
     if not supported:
         why = f"Solved as an isometric sheet, as set, although {why}."
+    if judgement.clear or required:
+        expect_only(search.should_stop, accepted_sheet(tracks.num_frames, tracks.num_points))
     surface = _everywhere(search, tracks, chosen)
     if surface is None:
         return IsometricVerdict("No isometric surface was found: its points are not connected.", _trace(tried))
@@ -288,18 +291,21 @@ def _glance(search: FocalSearch, focal: float) -> float:
 
 def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried) -> IsometricSurface | None:
     """Return the surface in all frames and points at the chosen focal length, or None if the anchors are not connected."""
+    enter(search.should_stop, "sheet")
     part = chosen.graph
     whole = search.graph(chosen.focal)
     afresh = maximum_depth(part, should_stop=search.should_stop)
     found = chosen.found if afresh is None else refine_with_restarts(part, afresh, should_stop=search.should_stop)
     found = min(found, chosen.found, key=lambda each: each.inconsistency)
     if len(search.frames) < tracks.num_frames:
+        enter(search.should_stop, "sheet_frames")
         found = refine_with_restarts(whole, _from_similar(whole, search, found.depths), should_stop=search.should_stop)
     found = refine_along_surface(whole, found, should_stop=search.should_stop)
     template = flatten(search.edges, found.lengths, search.seen.shape[1])
     if template is None:
         return None
     points, enough = complete_anchors(found.depths[..., None] * whole.rays, search.seen, template)
+    enter(search.should_stop, "sheet_points")
     all_of_it: Extended = extend(
         tracks.points, relative(tracks.visible, float(tracks.visible.max())), images=search.anchors.points, known=search.seen,
         anchors=points, template=template, focal=chosen.focal, centre=search.centre,

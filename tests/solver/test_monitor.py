@@ -15,10 +15,11 @@ from pliant.solver.isometry import surface
 from pliant.solver.model import expectation_maximisation
 from pliant.solver.monitor import PACE_PRIOR, Monitor
 from pliant.solver.pulse import pulse, pulses_to
-from pliant.solver.stages import MOST_SHAPES_UNITS, Stage, planned, unseen_frames
+from pliant.solver.stages import MOST_SHAPES_UNITS, Stage, accepted_sheet, planned, unseen_frames
 from pliant.solver.threads import over_ranges, threads_limited
 from pliant.solver.tracks.completion import CHUNKS_PER_TICK, POINTS_PER_CHUNK, complete
 from pliant.solver.tracks.normalization import normalize
+from rolled_sheets import SIZE, rolled
 
 
 def small(*, noisy: bool = False) -> Tracks:
@@ -247,6 +248,44 @@ def test_choosing_anchors_in_all_frames_is_a_stage_of_its_own(frames: int, monke
         stage.name: stage.seconds for stage in planned(10 * frames, 60, gaussian=True, known_cameras=False, sheet=True)
     }
     assert times["anchors"] == pytest.approx(0.1 * frames)
+
+
+def test_an_accepted_sheet_replaces_the_plan_unless_it_turns_out_to_be_rigid() -> None:
+    clock = Clock(Stage("surface", 10.0, 10), Stage("multistart", 100.0, 10), Stage("shapes", 50.0, 10))
+    clock.work(10, 1.0)
+    pace = (PACE_PRIOR + 10) / (PACE_PRIOR + 9)  # 10 s for .9 of the stage
+    assert clock.left == pytest.approx(1 + 150 * pace, rel=0.01)
+    clock.monitor.expect_only([Stage("sheet", 5.0, 10), Stage("sheet_points", 1.0, 1)])
+    clock.monitor.enter("sheet")
+    assert clock.left == pytest.approx(6 * pace, rel=0.01)
+    clock.monitor.enter("multistart")
+    assert clock.left == pytest.approx(150 * pace, rel=0.01)
+    clock.monitor.enter("sheet")  # no longer planned
+    assert clock.monitor.current.name == "multistart"
+
+
+@pytest.mark.parametrize("frames", [12, 30])
+def test_an_accepted_sheet_goes_through_its_planned_stages(frames: int) -> None:
+    tracks = rolled(frames=frames, side=6).tracks
+    plan = planned(frames, tracks.num_points, gaussian=True, known_cameras=False, sheet=True)
+    monitor, entered = Monitor(plan=plan), list[str]()
+    enter = monitor.enter
+
+    def noted(name: str, *, units: int | None = None) -> None:
+        enter(name, units=units)
+        entered.append(monitor.current.name)
+
+    monitor.enter = noted  # type: ignore[method-assign]
+    verdict = surface.isometric_surface(tracks, image_size=SIZE, should_stop=monitor)
+    assert verdict.surface is not None
+    sheet = [stage.name for stage in accepted_sheet(frames, tracks.num_points)]
+    assert (
+        entered[-len(sheet) :]
+        == sheet
+        == (["sheet", "sheet_frames", "sheet_points"] if frames > 24 else ["sheet", "sheet_points"])
+    )
+    monitor.report(Step("cameras", 0.0))
+    assert monitor._seconds_left() < 1
 
 
 class Clock:
