@@ -98,9 +98,10 @@ class Monitor:
         units : int, optional
             Expected units of work, replacing the planned number.
         """
-        if any(stage.name == name for stage in self._unlikely):
-            self._ahead, self._unlikely = self._unlikely, []
         place = self._place(name)
+        if place is None and any(stage.name == name for stage in self._unlikely):
+            self._ahead, self._unlikely = self._unlikely, []
+            place = self._place(name)
         if place is None:
             return
         done, now = self._share * self.current.seconds, self._clock()  # less than planned if it ended early
@@ -121,7 +122,7 @@ class Monitor:
 
     def expect_only(self, stages: Sequence[Stage]) -> None:
         """Replace the stages ahead, which probably do not run, until one of them begins."""
-        self._ahead, self._unlikely = list(stages), self._ahead
+        self._ahead, self._unlikely = list(stages), [*self._ahead, *self._unlikely]
 
     def report(self, step: Step) -> None:
         """Report a step with the present fraction and remaining time; a fraction of 1 is kept."""

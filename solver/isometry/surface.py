@@ -25,7 +25,7 @@ from pliant.solver.isometry.restarts import carried, refine_with_restarts, unlik
 from pliant.solver.monitor import enter, expect_only
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, Tracks
-from pliant.solver.stages import accepted_sheet
+from pliant.solver.stages import accepted_sheet, search_for_sheet
 from pliant.solver.tracks.normalization import relative
 
 ANCHORS = 60
@@ -136,6 +136,9 @@ def isometric_surface(
     should_stop : callable, optional
         Called between units of work. If it returns True during the search, isometry is rejected; later, refinement ends early.
     """
+    if required:
+        rest = accepted_sheet(tracks.num_frames, tracks.num_points)
+        expect_only(should_stop, [*search_for_sheet(tracks.num_frames)[1:], *rest])
     diagonal, centre = _diagonal(tracks, image_size), _centre(tracks, principal_point, image_size)
     first = focal if focal is not None else TYPICAL_FOCAL * diagonal
     search = _search(tracks, centre, first, required, should_stop)

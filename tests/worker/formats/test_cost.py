@@ -38,3 +38,12 @@ def test_the_smooth_prior_counts_the_gram_matrix_of_all_frames() -> None:
     points, frames = largest_that_fits(10**9, 3000, 300, Options(prior="smooth"))
     assert 0 < points < 300
     assert 2000 < frames < 3000
+
+
+@pytest.mark.parametrize(
+    ("frames", "points", "measured"),
+    [(20, 144, 7.9), (60, 144, 13.9), (150, 10_000, 23.8), (600, 144, 46.2), (3000, 144, 221)],
+)
+def test_sheets_are_estimated_within_a_factor_of_two(frames: int, points: int, measured: float) -> None:
+    seconds = estimated(frames, points, Options(surface="isometric", image_size=(1280, 720))).seconds
+    assert measured / 2 < seconds < 2 * measured
