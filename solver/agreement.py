@@ -200,7 +200,7 @@ def separate_points_warnings(tracks: Tracks) -> tuple[str, ...]:
     if apart < MIN_POINTS:
         return ()
     return (
-        f"No frame connects {apart} of the points to the others, as in tracks across a cut: how they lie to each other is a guess. "
+        f"No frame connects {apart} of the points to the others, as in tracks across a cut: their position relative to these is a guess. "
         "Solve each part of the film on its own.",
     )
 

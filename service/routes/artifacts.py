@@ -57,7 +57,7 @@ def artifact(id: Id, name: Name, request: Request, jobs: Mine, core: Core, redir
     """Return a file. `Range` with `If-Range` resumes a download; `ETag` and `Repr-Digest` are its SHA-256.
 
     With `redirect=true` a service that stores files in S3 may return 307 with a presigned URL: send `Range` to it, too, but neither
-    `If-Range` nor `Authorization`. Otherwise the parameter has no effect, nor has it with HEAD, because the URL is signed for GET.
+    `If-Range` nor `Authorization`. Otherwise, and with HEAD, because the URL is signed for GET, the parameter has no effect.
     """
     about, blob = _open(jobs, id, name)
     size = blob.size
