@@ -21,7 +21,7 @@ from pliant.solver import (
 )
 from pliant.solver.evaluation.metrics import e3d_frame
 from pliant.solver.evaluation.trust import (
-    UNESTIMATED,
+    NO_POSTERIOR,
     Trust,
     Verdict,
     assess,
@@ -184,17 +184,17 @@ def test_without_a_posterior_the_error_is_not_estimated() -> None:
     assert trust.expected_error is None
     assert trust.sentence.startswith("The error is not estimated")
     assert trust.verdict is Verdict.WITH_CARE
-    assert trust.reasons == (UNESTIMATED,)
+    assert trust.reasons == (NO_POSTERIOR,)
 
 
 @pytest.mark.parametrize("options", [{"prior": "smooth"}, {"preset": "paper"}, {"method": "pseudo_inverse"}])
 def test_methods_without_a_posterior_are_never_good(options: dict[str, Any]) -> None:
-    """Their tracks are explained and their camera turns far enough, whatever the depth."""
+    """They explain the tracks, and the camera turns far enough, however wrong the depth is."""
     found = solve(gallery.face(16, 60, degrees=70).tracks, settings=Settings(**options)).trust
     assert found is not None
     assert found.turn_degrees > 20
     assert found.verdict is not Verdict.GOOD
-    assert UNESTIMATED in found.reasons
+    assert NO_POSTERIOR in found.reasons
 
 
 def test_the_figures_behind_the_verdict_are_reported() -> None:
@@ -281,7 +281,7 @@ def test_given_weights_that_outweigh_the_tracks_need_care() -> None:
     trust = judged(residuals=far, given_weights=True)
     assert (trust.verdict, trust.interval) == (Verdict.WITH_CARE, None)
     assert "more than 3 times the noise" in trust.reasons[0]
-    assert judged(residuals=far, given_weights=True, shapes_std=None).reasons == (UNESTIMATED,)
+    assert judged(residuals=far, given_weights=True, shapes_std=None).reasons == (NO_POSTERIOR,)
 
 
 @pytest.mark.parametrize("weight", ["temporal_weight", "spatial_weight"])
