@@ -53,7 +53,7 @@ outweigh the tracks; Gaussian noise has 1.2. A face of 20 × 200, clean and with
 of the face whose error the weights raise to .14 and more, and, on the clean flag, two whose error they hardly change; those of the sphere
 are wrong with any weight."""
 
-NO_POSTERIOR = "Only the learned prior, the default, estimates the error. Here nothing shows how far depth is off; compare with the default settings."
+NO_POSTERIOR = "Only the learned prior, the default, estimates the error. Here nothing shows how far depth is off; compare with it."
 """Reason of a free surface whose prior is not the learned one, or has weight 0. On clean recorded sequences with estimated cameras
 (`benchmarks.accuracy`), errors of the method `pseudo_inverse` are .19 to .73, those of the smooth prior .002 to .17."""
 
