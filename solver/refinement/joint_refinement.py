@@ -240,9 +240,12 @@ def _of_observations(evidence: Evidence, found: Learned, how: Refinement) -> tup
     translations = np.array(estimate.translations)
     completed = Moments(evidence.gram, evidence.sample, translations[used], estimate.outlier_share)
     observed = Observed.of(evidence.normalized, estimate, used)
-    found, moments = on_observations(observed, found, completed, evidence.start_scales[used], how)
+    found, moments, inverse_focal = on_observations(observed, found, completed, evidence.start_scales[used], how)
     translations[used] = moments.translations
     estimate = replace(estimate, translations=translations)
+    if evidence.is_perspective:
+        assert estimate.perspective is not None
+        estimate = replace(estimate, perspective=replace(estimate.perspective, inverse_focal=inverse_focal))
     return replace(evidence, estimate=estimate, gram=moments.gram, sample=moments.sample), found
 
 

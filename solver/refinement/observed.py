@@ -4,6 +4,10 @@ The completion of `tracks.completion` ignores cameras and shapes, treats its pre
 `cross_fitted` finds these outliers with a covariance learned from other points. `on_observations` completes the camera estimation: it
 alternates between expected moments of the complete tracks (`model.observation_model`) and cameras, which is expectation maximisation with
 L-BFGS on the marginal likelihood as its M-step.
+
+Under perspective, κ is estimated once more as well. Completion is orthographic: it predicts hidden entries, and part of entries of low
+confidence, as if there were no perspective, so a focal length learned from completed tracks is too long. Expected tracks have the
+perspective of the latest κ instead.
 """
 
 from __future__ import annotations
@@ -16,15 +20,19 @@ from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import Perspective, corrected, depth_map
 from pliant.solver.model.expectation_maximisation import ModelOrder, learned
 from pliant.solver.model.observation_model import ImageDensity, inlier_probabilities
+from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, projections_of
+from pliant.solver.refinement.depth_alternation import alternate
 from pliant.solver.refinement.learned import START_EM_ROUNDS, Learned, Refinement
-from pliant.solver.tracks.completion import often_visible
+from pliant.solver.tracks.completion import briefly_hidden, often_visible
 from pliant.solver.tracks.matrix import columns, gram_of, points_of
 from pliant.solver.tracks.normalization import Normalized
 
 ROUNDS = 3
-"""Updates of expected moments and cameras; other numbers were not tried."""
+"""Updates of expected moments and cameras, and of κ under perspective. With 5, focal lengths are closer and errors about the same: of four
+tracked films of a face 1.10, 1.10, 1.07 and 1.14 times the true one instead of 1.19, 1.10, 1.07 and 1.14; without perspective, other
+numbers were not tried."""
 
 FOLDS = 2
 """Folds of the points, each scored by a covariance learned from the others; other numbers were not tried."""
@@ -49,6 +57,9 @@ class Observed:
     often: NDArray[np.bool_]
     """Mask of the often visible points, shape `(S,)`: their mean is the origin of the depths."""
 
+    briefly: NDArray[np.bool_]
+    """Mask of the points from which κ is learned, shape `(S,)`."""
+
     view: Perspective | None
     """Perspective at the frames used; None where tracks are not corrected."""
 
@@ -61,8 +72,8 @@ class Observed:
         weight = np.where(estimate.filling.outliers(points, confidence), 0.0, confidence)
         view = estimate.perspective
         view = replace(view, offsets=view.offsets[used]) if view is not None and view.is_perspective else None
-        often = often_visible(normalized.visible)[chosen]
-        return cls(points[used], confidence[used], weight[used], chosen, often, view)
+        often, briefly = (mask(normalized.visible)[chosen] for mask in (often_visible, briefly_hidden))
+        return cls(points[used], confidence[used], weight[used], chosen, often, briefly, view)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,8 +149,8 @@ def on_observations(
     completed: Moments,
     start_scales: Floats,
     how: Refinement,
-) -> tuple[Learned, Moments]:
-    """Return cameras and covariance estimated from the observations, and the expected moments.
+) -> tuple[Learned, Moments, float]:
+    """Return cameras, covariance and κ estimated from the observations, and the expected moments.
 
     Parameters
     ----------
@@ -154,15 +165,38 @@ def on_observations(
     how : Refinement
         What is refined.
     """
+    view = observed.view
     if how.should_stop():
-        return found, completed
+        return found, completed, 0.0 if view is None else view.inverse_focal
     moments = _expected(observed, found, completed, start_scales)
     for _ in range(ROUNDS):
         if how.should_stop():
             break
+        if view is not None:
+            found, observed = _refocused(observed, found, moments, start_scales, how)
+            moments = _expected(observed, found, moments, start_scales)
         found = how.refine_once(moments.gram, found)
         moments = _expected(observed, found, moments, start_scales)
-    return found, moments
+    return found, moments, 0.0 if observed.view is None else observed.view.inverse_focal
+
+
+def _refocused(
+    observed: Observed, found: Learned, moments: Moments, start_scales: Floats, how: Refinement
+) -> tuple[Learned, Observed]:
+    """Return cameras and covariance after one round of alternation on the expected tracks, and the observations with its κ."""
+    assert observed.view is not None
+    view = replace(observed.view, learning_sample=_as_seen(observed, found, moments, start_scales)[:, observed.briefly])
+    absolute = replace(found, scales=found.scales * start_scales)
+    absolute, view = alternate(view, absolute, np.arange(len(start_scales)), how, rounds=1)
+    return replace(absolute, scales=absolute.scales / start_scales), replace(observed, view=view)
+
+
+def _as_seen(observed: Observed, found: Learned, moments: Moments, start_scales: Floats) -> Floats:
+    """Return the expected tracks with the perspective of the latest κ, relative to the principal point, shape `(F', S, 2)`."""
+    assert observed.view is not None
+    view, depths = observed.view, _depths(observed, found, moments, start_scales)
+    complete = moments.sample * start_scales[:, None, None] + (moments.translations + view.offsets)[:, None]
+    return np.asarray(complete / np.maximum(1 + view.inverse_focal * depths, MIN_RELATIVE_DISTANCE)[..., None])
 
 
 def _expected(observed: Observed, found: Learned, before: Moments, start_scales: Floats) -> Moments:
@@ -190,8 +224,12 @@ def _corrected(observed: Observed, found: Learned, before: Moments, start_scales
     view = observed.view
     if view is None:
         return observed.points
-    complete = before.sample * start_scales[:, None, None]
-    depth = depth_map(found.rotations, found.scales * start_scales, found.covariance)
-    depths = depth @ columns(complete)
-    depths -= depths[:, observed.often].mean(axis=1, keepdims=True)
+    depths = _depths(observed, found, before, start_scales)
     return corrected(observed.points + view.offsets[:, None], depths, view.inverse_focal) - view.offsets[:, None]
+
+
+def _depths(observed: Observed, found: Learned, moments: Moments, start_scales: Floats) -> Floats:
+    """Return the depths of the expected tracks relative to the mean of the often visible points, shape `(F', S)`."""
+    depth = depth_map(found.rotations, found.scales * start_scales, found.covariance)
+    depths = depth @ columns(moments.sample * start_scales[:, None, None])
+    return np.asarray(depths - depths[:, observed.often].mean(axis=1, keepdims=True))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pliant.solver import KnownCamera, Settings, Tracks, estimate_cameras, gallery
 from pliant.solver.cameras.estimation import given_cameras
-from pliant.solver.cameras.perspective import Perspective, corrected
+from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.model.expectation_maximisation import MAX_MODES
 from pliant.solver.reconstruction import cameras as reconstruction
 from pliant.solver.records import Floats
@@ -22,6 +22,7 @@ KNOWN = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
 USED = np.arange(20)
 ONES = np.ones(20)
 KEPT = Refinement(turning=False)
+KAPPA = 0.1
 
 
 def begun(tracks: Tracks) -> tuple[Observed, object, Moments]:
@@ -59,7 +60,7 @@ def test_expected_moments_are_nearer_to_the_truth_than_completed_tracks(outliers
     tracks = gallery.corrupt(MADE, noise=0.005, hidden=0.4, outliers=outliers, seed=3).tracks
     observed, _, completed = begun(tracks)
     start = KEPT.learn(completed.gram, np.asarray(KNOWN.rotations), ONES)
-    found, moments = on_observations(observed, start, completed, ONES, KEPT)
+    found, moments, _ = on_observations(observed, start, completed, ONES, KEPT)
     np.testing.assert_array_equal(found.rotations, KNOWN.rotations)
     true = true_sample(normalize(tracks).unit)
     hidden = observed.confidence == 0
@@ -71,30 +72,49 @@ def test_expected_moments_are_nearer_to_the_truth_than_completed_tracks(outliers
     assert moments.outlier_share == pytest.approx(outliers, abs=0.012)
 
 
+def seen_by_a_pinhole(observed: Observed, tracks: Tracks, **view: float) -> Observed:
+    """Return the observations with the perspective of κ = `KAPPA` and, unless `view` says otherwise, the same κ to start from."""
+    depths = np.einsum("fj,fpj->fp", MADE.rotations[:, 2], MADE.shapes) / normalize(tracks).unit
+    depths -= depths.mean(axis=1, keepdims=True)
+    bent = observed.points / (1 + KAPPA * depths)[..., None]
+    found = Perspective(np.zeros((20, 2)), np.zeros(2), **{"inverse_focal": KAPPA, **view})  # type: ignore[arg-type]
+    return replace(observed, points=bent, view=found)
+
+
 def test_perspective_is_corrected_with_the_depths_of_the_expected_tracks() -> None:
     """Tracks of a pinhole give the moments that the same tracks give under orthography."""
     tracks = gallery.corrupt(MADE, hidden=0.2, seed=2).tracks
     observed, _, completed = begun(tracks)
     start = KEPT.learn(completed.gram, np.asarray(KNOWN.rotations), ONES)
-    _, flat = on_observations(observed, start, completed, ONES, KEPT)
-    unit, inverse_focal = normalize(tracks).unit, 0.1
-    depths = np.einsum("fj,fpj->fp", MADE.rotations[:, 2], MADE.shapes) / unit
-    depths -= depths.mean(axis=1, keepdims=True)
-    bent = np.asarray(corrected(observed.points, np.zeros_like(depths), 0.0)) / (1 + inverse_focal * depths)[..., None]
-    view = Perspective(np.zeros((20, 2)), np.zeros(2), inverse_focal=inverse_focal)
-    pinhole = replace(observed, points=bent, view=view)
-    _, moments = on_observations(pinhole, start, completed, ONES, KEPT)
+    _, flat, _ = on_observations(observed, start, completed, ONES, KEPT)
+    pinhole = seen_by_a_pinhole(observed, tracks, given=KAPPA)
+    _, moments, _ = on_observations(pinhole, start, completed, ONES, KEPT)
     uncorrected = replace(pinhole, view=None)
-    _, wrong = on_observations(uncorrected, start, completed, ONES, KEPT)
+    _, wrong, _ = on_observations(uncorrected, start, completed, ONES, KEPT)
     error, least = (np.linalg.norm(each.sample - flat.sample) for each in (wrong, moments))
     assert least < 0.25 * error
+
+
+@pytest.mark.parametrize("confidence", [0.0, 0.3])
+def test_the_focal_length_follows_the_observations_and_not_their_orthographic_completion(confidence: float) -> None:
+    """Entries that are hidden or of low confidence keep κ too small for as long as completion replaces them."""
+    random = np.random.default_rng(4)
+    visible = np.where(random.random(MADE.tracks.points.shape[:2]) < 0.4, confidence, 1.0)
+    tracks = Tracks.from_arrays(MADE.tracks.points, visible)
+    observed, _, completed = begun(tracks)
+    start = KEPT.learn(completed.gram, np.asarray(KNOWN.rotations), ONES)
+    free = seen_by_a_pinhole(observed, tracks, inverse_focal=0.6 * KAPPA)
+    _, _, found = on_observations(free, start, completed, ONES, KEPT)
+    assert found == pytest.approx(KAPPA, rel=0.1)
+    given = seen_by_a_pinhole(observed, tracks, given=0.6 * KAPPA, inverse_focal=0.6 * KAPPA)
+    assert on_observations(given, start, completed, ONES, KEPT)[2] == 0.6 * KAPPA
 
 
 def test_a_stop_leaves_the_cameras() -> None:
     tracks = gallery.corrupt(MADE, hidden=0.2, seed=2).tracks
     observed, _, completed = begun(tracks)
     start = KEPT.learn(completed.gram, np.asarray(KNOWN.rotations), ONES)
-    found, moments = on_observations(observed, start, completed, ONES, Refinement(should_stop=lambda: True))
+    found, moments, _ = on_observations(observed, start, completed, ONES, Refinement(should_stop=lambda: True))
     assert found is start
     assert np.isfinite(moments.gram).all()
 
