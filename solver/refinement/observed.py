@@ -173,14 +173,14 @@ def on_observations(
         if how.should_stop():
             break
         if view is not None:
-            found, observed = _refocused(observed, found, moments, start_scales, how)
+            found, observed = _with_updated_focal(observed, found, moments, start_scales, how)
             moments = _expected(observed, found, moments, start_scales)
         found = how.refine_once(moments.gram, found)
         moments = _expected(observed, found, moments, start_scales)
     return found, moments, 0.0 if observed.view is None else observed.view.inverse_focal
 
 
-def _refocused(
+def _with_updated_focal(
     observed: Observed, found: Learned, moments: Moments, start_scales: Floats, how: Refinement
 ) -> tuple[Learned, Observed]:
     """Return cameras and covariance after one round of alternation on the expected tracks, and the observations with its κ."""
