@@ -196,6 +196,7 @@ def alive(jobs: Jobs, name: str, memory: str) -> None:
 
     client = connect(jobs.settings.redis, decode=True)
     client.sadd(f"rq:workers:{jobs.settings.queue}", f"rq:worker:{name}")
+    client.hset(f"rq:worker:{name}", "state", "busy")  # the clean-up removes names without a record
     client.set(alive_key(jobs.settings.queue, name), f"1{memory}", ex=60)
     client.close()
 
