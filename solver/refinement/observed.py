@@ -5,8 +5,8 @@ The completion of `tracks.completion` ignores cameras and shapes, treats its pre
 alternates between expected moments of the complete tracks (`model.observation_model`) and cameras, which is expectation maximisation with
 L-BFGS on the marginal likelihood as its M-step.
 
-Under perspective, κ is estimated once more as well. Completion is orthographic: it predicts hidden entries, and part of entries of low
-confidence, as if there were no perspective, so a focal length learned from completed tracks is too long. Expected tracks have the
+Under perspective, κ is estimated once more as well. Completion is orthographic, both where it predicts hidden entries and where it moves
+entries of low confidence towards its prediction, so a focal length learned from completed tracks is too long. Expected tracks have the
 perspective of the latest κ instead.
 """
 
@@ -62,6 +62,11 @@ class Observed:
 
     view: Perspective | None
     """Perspective at the frames used; None where tracks are not corrected."""
+
+    @property
+    def inverse_focal(self) -> float:
+        """κ, inverse normalized units; 0 without perspective."""
+        return 0.0 if self.view is None else self.view.inverse_focal
 
     @classmethod
     def of(cls, normalized: Normalized, estimate: CameraEstimate, used: NDArray[np.intp]) -> Observed:
@@ -165,19 +170,18 @@ def on_observations(
     how : Refinement
         What is refined.
     """
-    view = observed.view
     if how.should_stop():
-        return found, completed, 0.0 if view is None else view.inverse_focal
+        return found, completed, observed.inverse_focal
     moments = _expected(observed, found, completed, start_scales)
     for _ in range(ROUNDS):
         if how.should_stop():
             break
-        if view is not None:
+        if observed.view is not None:
             found, observed = _with_updated_focal(observed, found, moments, start_scales, how)
             moments = _expected(observed, found, moments, start_scales)
         found = how.refine_once(moments.gram, found)
         moments = _expected(observed, found, moments, start_scales)
-    return found, moments, 0.0 if observed.view is None else observed.view.inverse_focal
+    return found, moments, observed.inverse_focal
 
 
 def _with_updated_focal(

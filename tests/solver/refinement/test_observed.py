@@ -97,7 +97,7 @@ def test_perspective_is_corrected_with_the_depths_of_the_expected_tracks() -> No
 
 @pytest.mark.parametrize("confidence", [0.0, 0.3])
 def test_the_focal_length_follows_the_observations_and_not_their_orthographic_completion(confidence: float) -> None:
-    """Entries that are hidden or of low confidence keep κ too small for as long as completion replaces them."""
+    """A κ that is too small, as completed tracks make it, becomes the true one where 40 % of the entries are hidden or uncertain."""
     random = np.random.default_rng(4)
     visible = np.where(random.random(MADE.tracks.points.shape[:2]) < 0.4, confidence, 1.0)
     tracks = Tracks.from_arrays(MADE.tracks.points, visible)
