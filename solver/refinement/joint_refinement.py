@@ -90,6 +90,8 @@ def refine_cameras(
     evidence, found = _refined(start, trial, how)
     if estimate.filling is not None and np.isfinite(found.energy):
         evidence, found = _of_observations(evidence, found, how)
+        if evidence.estimate.depth_is_typical:
+            evidence, found = _at_probable_depth_again(evidence, found)
         # The order limits the modes of completed tracks; expected moments include the uncertainty of hidden entries. Errors
         # without and with the limit: shark with all errors .063 and .088, face landmarks .027 and .024.
         model_order = replace(model_order, max_modes=MAX_MODES)
@@ -210,6 +212,20 @@ def _with_probable_focal(evidence: Evidence, found: Learned) -> tuple[Evidence, 
         return evidence, found
     evidence = with_stretched_depth(evidence, moved, stretch)
     return replace(evidence, estimate=_with_depth_choice(evidence.estimate, stretch)), moved
+
+
+def _at_probable_depth_again(evidence: Evidence, found: Learned) -> tuple[Evidence, Learned]:
+    """Return cameras and covariance at the most probable depth, and the evidence with the focal length that belongs to it.
+
+    Refinement on the observations prefers too little rotation, like the refinement before it. Corrected tracks stay the same.
+    """
+    moved, stretch = at_probable_depth(evidence.gram, found)
+    view = evidence.estimate.perspective
+    if view is None or not view.is_perspective:
+        return evidence, moved
+    std = None if view.inverse_focal_std is None else view.inverse_focal_std / stretch
+    view = replace(view, inverse_focal=view.inverse_focal / stretch, inverse_focal_std=std)
+    return replace(evidence, estimate=replace(evidence.estimate, perspective=view)), moved
 
 
 def _mirrored(estimate: CameraEstimate, rotations: Floats, found: Learned) -> tuple[CameraEstimate, Floats, Learned]:

@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pliant.solver import Settings, Tracks, estimate_cameras, gallery, solve
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.gallery.sequence import Sequence
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR, angles_between, exponential
@@ -123,6 +125,35 @@ def test_a_head_that_turns_by_2_degrees_gets_a_plausible_depth() -> None:
     assert solution.trust is not None
     assert solution.trust.verdict != "good"
     assert solution.trust.interval is None
+
+
+@pytest.mark.slow
+def test_refinement_on_observations_does_not_deepen_a_head_that_turns_by_2_degrees() -> None:
+    """With the step only before it, the depth is 3.1 times the true one."""
+    head = gallery.face(12, 60, degrees=1, tilt=0.5, seed=1)
+    tracks, _ = gallery.corrupt_tracks(head.tracks, noise=0.003, seed=0)
+    visible = np.random.default_rng(0).random(tracks.points.shape[:2]) > 0.3
+    solution = solve(Tracks.from_arrays(tracks.points, visible), head.mesh)
+    found = depth_of(solution.shapes, solution.camera.rotations)
+    assert 0.5 < found / depth_of(head.shapes, head.rotations) < 2
+
+
+def test_a_second_step_changes_the_focal_length_with_the_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    gram, given = found(8, 0.5)
+    moved = bas_relief._stretched(given, 0.5, *bas_relief._decomposed(given.rotations))
+    monkeypatch.setattr(joint_refinement, "at_probable_depth", lambda *_: (moved, 0.5))
+    view = Perspective(np.zeros((FRAMES, 2)), np.zeros(2), inverse_focal=0.1, inverse_focal_std=0.02)
+    scales, points = np.ones(FRAMES), np.zeros((FRAMES, 4, 2))
+    estimate = CameraEstimate(given.rotations, scales, np.zeros((FRAMES, 2)), 0, gram, points, perspective=view)
+    normalized = normalize(gallery.face(FRAMES, 4).tracks)
+    evidence = Evidence(estimate, normalized, np.arange(FRAMES), scales, gram, points)
+    again, cameras = joint_refinement._at_probable_depth_again(evidence, given)
+    assert cameras is moved
+    assert again.estimate.perspective is not None
+    assert (again.estimate.perspective.inverse_focal, again.estimate.perspective.inverse_focal_std) == (0.2, 0.04)
+    assert again.gram is gram
+    plain = replace(evidence, estimate=replace(estimate, perspective=None))
+    assert joint_refinement._at_probable_depth_again(plain, given) == (plain, moved)
 
 
 @pytest.mark.slow
