@@ -90,8 +90,6 @@ def refine_cameras(
     evidence, found = _refined(start, trial, how)
     if estimate.filling is not None and np.isfinite(found.energy):
         evidence, found = _of_observations(evidence, found, how)
-        if evidence.estimate.depth_is_typical:
-            evidence, found = _at_probable_depth_again(evidence, found)
         # The order limits the modes of completed tracks; expected moments include the uncertainty of hidden entries. Errors
         # without and with the limit: shark with all errors .063 and .088, face landmarks .027 and .024.
         model_order = replace(model_order, max_modes=MAX_MODES)
@@ -214,20 +212,6 @@ def _with_probable_focal(evidence: Evidence, found: Learned) -> tuple[Evidence, 
     return replace(evidence, estimate=_with_depth_choice(evidence.estimate, stretch)), moved
 
 
-def _at_probable_depth_again(evidence: Evidence, found: Learned) -> tuple[Evidence, Learned]:
-    """Return cameras and covariance at the most probable depth, and the evidence with the focal length that belongs to it.
-
-    Refinement on the observations prefers too little rotation, like the refinement before it. Corrected tracks stay the same.
-    """
-    moved, stretch = at_probable_depth(evidence.gram, found)
-    view = evidence.estimate.perspective
-    if view is None or not view.is_perspective:
-        return evidence, moved
-    std = None if view.inverse_focal_std is None else view.inverse_focal_std / stretch
-    view = replace(view, inverse_focal=view.inverse_focal / stretch, inverse_focal_std=std)
-    return replace(evidence, estimate=replace(evidence.estimate, perspective=view)), moved
-
-
 def _mirrored(estimate: CameraEstimate, rotations: Floats, found: Learned) -> tuple[CameraEstimate, Floats, Learned]:
     """Return the estimate, its rotations in the axes of `found`, and `found`, all mirrored in depth."""
     ours, other = (MIRROR @ np.asarray(each) @ MIRROR for each in (estimate.rotations, rotations))
@@ -256,12 +240,13 @@ def _of_observations(evidence: Evidence, found: Learned, how: Refinement) -> tup
     translations = np.array(estimate.translations)
     completed = Moments(evidence.gram, evidence.sample, translations[used], estimate.outlier_share)
     observed = Observed.of(evidence.normalized, estimate, used)
-    found, moments, inverse_focal = on_observations(observed, found, completed, evidence.start_scales[used], how)
+    found, moments, view = on_observations(observed, found, completed, evidence.start_scales[used], how)
     translations[used] = moments.translations
     estimate = replace(estimate, translations=translations)
-    if evidence.is_perspective:
+    if view is not None:
         assert estimate.perspective is not None
-        estimate = replace(estimate, perspective=replace(estimate.perspective, inverse_focal=inverse_focal))
+        view = replace(estimate.perspective, inverse_focal=view.inverse_focal, inverse_focal_std=view.inverse_focal_std)
+        estimate = replace(estimate, perspective=view)
     return replace(evidence, estimate=estimate, gram=moments.gram, sample=moments.sample), found
 
 

@@ -7,7 +7,7 @@ L-BFGS on the marginal likelihood as its M-step.
 
 Under perspective, κ is estimated once more as well. Completion is orthographic, both where it predicts hidden entries and where it moves
 entries of low confidence towards its prediction, so a focal length learned from completed tracks is too long. Expected tracks have the
-perspective of the latest κ instead.
+perspective of the latest κ instead. Where only a prior determines the depth, it is estimated again after every refinement.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from pliant.solver.model.observation_model import ImageDensity, inlier_probabili
 from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats, projections_of
+from pliant.solver.refinement.bas_relief import at_probable_depth
 from pliant.solver.refinement.depth_alternation import alternate
 from pliant.solver.refinement.learned import START_EM_ROUNDS, Learned, Refinement
 from pliant.solver.tracks.completion import briefly_hidden, often_visible
@@ -63,10 +64,8 @@ class Observed:
     view: Perspective | None
     """Perspective at the frames used; None where tracks are not corrected."""
 
-    @property
-    def inverse_focal(self) -> float:
-        """κ, inverse normalized units; 0 without perspective."""
-        return 0.0 if self.view is None else self.view.inverse_focal
+    depth_is_typical: bool
+    """As in `CameraEstimate`."""
 
     @classmethod
     def of(cls, normalized: Normalized, estimate: CameraEstimate, used: NDArray[np.intp]) -> Observed:
@@ -78,7 +77,9 @@ class Observed:
         view = estimate.perspective
         view = replace(view, offsets=view.offsets[used]) if view is not None and view.is_perspective else None
         often, briefly = (mask(normalized.visible)[chosen] for mask in (often_visible, briefly_hidden))
-        return cls(points[used], confidence[used], weight[used], chosen, often, briefly, view)
+        return cls(
+            points[used], confidence[used], weight[used], chosen, often, briefly, view, estimate.depth_is_typical
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,8 +155,8 @@ def on_observations(
     completed: Moments,
     start_scales: Floats,
     how: Refinement,
-) -> tuple[Learned, Moments, float]:
-    """Return cameras, covariance and κ estimated from the observations, and the expected moments.
+) -> tuple[Learned, Moments, Perspective | None]:
+    """Return cameras and covariance estimated from the observations, the expected moments, and the perspective with its κ.
 
     Parameters
     ----------
@@ -171,7 +172,7 @@ def on_observations(
         What is refined.
     """
     if how.should_stop():
-        return found, completed, observed.inverse_focal
+        return found, completed, observed.view
     moments = _expected(observed, found, completed, start_scales)
     for _ in range(ROUNDS):
         if how.should_stop():
@@ -180,8 +181,10 @@ def on_observations(
             found, observed = _with_updated_focal(observed, found, moments, start_scales, how)
             moments = _expected(observed, found, moments, start_scales)
         found = how.refine_once(moments.gram, found)
+        if observed.depth_is_typical:
+            found, observed = _with_typical_depth(observed, found, moments)
         moments = _expected(observed, found, moments, start_scales)
-    return found, moments, observed.inverse_focal
+    return found, moments, observed.view
 
 
 def _with_updated_focal(
@@ -193,6 +196,20 @@ def _with_updated_focal(
     absolute = replace(found, scales=found.scales * start_scales)
     absolute, view = alternate(view, absolute, np.arange(len(start_scales)), how, rounds=1)
     return replace(absolute, scales=absolute.scales / start_scales), replace(observed, view=view)
+
+
+def _with_typical_depth(observed: Observed, found: Learned, moments: Moments) -> tuple[Learned, Observed]:
+    """Return cameras and covariance at the most probable depth, and the observations with the κ that belongs to it.
+
+    Refinement prefers too little rotation, with the observations as with completed tracks. Corrected tracks stay the same.
+    """
+    moved, stretch = at_probable_depth(moments.gram, found)
+    view = observed.view
+    if view is None:
+        return moved, observed
+    std = None if view.inverse_focal_std is None else view.inverse_focal_std / stretch
+    view = replace(view, inverse_focal=view.inverse_focal / stretch, inverse_focal_std=std)
+    return moved, replace(observed, view=view)
 
 
 def _as_seen(observed: Observed, found: Learned, moments: Moments, start_scales: Floats) -> Floats:

@@ -6,17 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pliant.solver import Settings, Tracks, estimate_cameras, gallery, solve
-from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver import KnownCamera, Settings, Tracks, estimate_cameras, gallery, solve
+from pliant.solver.cameras.estimation import given_cameras
 from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.gallery.sequence import Sequence
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR, angles_between, exponential
-from pliant.solver.refinement import bas_relief, joint_refinement
+from pliant.solver.refinement import bas_relief, joint_refinement, observed
 from pliant.solver.refinement.bas_relief import LOG_DEPTH_STD, VISIBLE_DEPTH, at_probable_depth, bulges, extent_penalty
 from pliant.solver.refinement.depth_rounds import with_stretched_depth
 from pliant.solver.refinement.evidence import Evidence
 from pliant.solver.refinement.learned import Learned
+from pliant.solver.refinement.observed import Moments, Observed
 from pliant.solver.tracks.normalization import normalize
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
@@ -138,22 +139,21 @@ def test_refinement_on_observations_does_not_deepen_a_head_that_turns_by_2_degre
     assert 0.5 < found / depth_of(head.shapes, head.rotations) < 2
 
 
-def test_a_second_step_changes_the_focal_length_with_the_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_focal_length_follows_the_typical_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     gram, given = found(8, 0.5)
     moved = bas_relief._stretched(given, 0.5, *bas_relief._decomposed(given.rotations))
-    monkeypatch.setattr(joint_refinement, "at_probable_depth", lambda *_: (moved, 0.5))
+    monkeypatch.setattr(observed, "at_probable_depth", lambda *_: (moved, 0.5))
+    head = gallery.face(FRAMES, 20)
+    normalized, scales = normalize(gallery.corrupt(head, hidden=0.1).tracks), np.ones(FRAMES)
+    estimate = given_cameras(normalized, KnownCamera.from_arrays(head.rotations, scales), Settings())
+    plain = Observed.of(normalized, estimate, np.arange(FRAMES))
+    moments = Moments(gram, estimate.sample, np.asarray(estimate.translations), 0.0)
+    assert observed._with_typical_depth(plain, given, moments) == (moved, plain)
     view = Perspective(np.zeros((FRAMES, 2)), np.zeros(2), inverse_focal=0.1, inverse_focal_std=0.02)
-    scales, points = np.ones(FRAMES), np.zeros((FRAMES, 4, 2))
-    estimate = CameraEstimate(given.rotations, scales, np.zeros((FRAMES, 2)), 0, gram, points, perspective=view)
-    normalized = normalize(gallery.face(FRAMES, 4).tracks)
-    evidence = Evidence(estimate, normalized, np.arange(FRAMES), scales, gram, points)
-    again, cameras = joint_refinement._at_probable_depth_again(evidence, given)
+    cameras, after = observed._with_typical_depth(replace(plain, view=view), given, moments)
     assert cameras is moved
-    assert again.estimate.perspective is not None
-    assert (again.estimate.perspective.inverse_focal, again.estimate.perspective.inverse_focal_std) == (0.2, 0.04)
-    assert again.gram is gram
-    plain = replace(evidence, estimate=replace(estimate, perspective=None))
-    assert joint_refinement._at_probable_depth_again(plain, given) == (plain, moved)
+    assert after.view is not None
+    assert (after.view.inverse_focal, after.view.inverse_focal_std) == (0.2, 0.04)
 
 
 @pytest.mark.slow

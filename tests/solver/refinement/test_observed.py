@@ -105,9 +105,12 @@ def test_the_focal_length_follows_the_observations_and_not_their_orthographic_co
     start = KEPT.learn(completed.gram, np.asarray(KNOWN.rotations), ONES)
     free = seen_by_a_pinhole(observed, tracks, inverse_focal=0.6 * KAPPA)
     _, _, found = on_observations(free, start, completed, ONES, KEPT)
-    assert found == pytest.approx(KAPPA, rel=0.1)
+    assert found is not None
+    assert found.inverse_focal == pytest.approx(KAPPA, rel=0.1)
     given = seen_by_a_pinhole(observed, tracks, given=0.6 * KAPPA, inverse_focal=0.6 * KAPPA)
-    assert on_observations(given, start, completed, ONES, KEPT)[2] == 0.6 * KAPPA
+    _, _, kept = on_observations(given, start, completed, ONES, KEPT)
+    assert kept is not None
+    assert kept.inverse_focal == 0.6 * KAPPA
 
 
 def test_a_stop_leaves_the_cameras() -> None:
