@@ -4,7 +4,7 @@ import { getOptions } from "./api";
 import { button, fill, h } from "./dom";
 import { chosen } from "./options";
 import { sentNames } from "./sent";
-import type { Job, Schema } from "./types";
+import { type Job, type Schema, ofFilm } from "./types";
 
 type Language = "Python" | "Shell" | "curl";
 
@@ -96,8 +96,6 @@ function parts(job: Job): [FormPart, ...FormPart[]] {
   if (seen.has_rotations) found.push(file("rotations", "cameras.npz"));
   return found;
 }
-
-const ofFilm = (job: Job): boolean => job.interpretation.mesh_source === "film";
 
 /** Return the code for a job. */
 function snippet(job: Job, options: Given, language: Language, url: string): string {
