@@ -139,10 +139,11 @@ function curl(job: Job, chosen: Given, url: string): string {
     ...(job.name ? [`-F ${quote(`name=${job.name}`)}`] : []),
     ...(chosen.length > 0 ? [`-F ${quote(`options=${JSON.stringify(Object.fromEntries(chosen))}`)}`] : []),
   ];
+  const animated = (job.options["outputs"] as string[]).includes("glb");
   return (
     `${[`curl ${quote(`${url}/v1/jobs`)}`, ...fields].join(" \\\n  ")}\n\n` +
-    `# this job's record, and its animated mesh\n` +
+    `# this job's record, and its ${animated ? "animated mesh" : "arrays"}\n` +
     `curl ${quote(`${url}/v1/jobs/${job.id}`)}\n` +
-    `curl --fail -O ${quote(`${url}/v1/jobs/${job.id}/artifacts/shapes.glb`)}\n`
+    `curl --fail -O ${quote(`${url}/v1/jobs/${job.id}/artifacts/shapes.${animated ? "glb" : "npz"}`)}\n`
   );
 }
