@@ -139,6 +139,18 @@ def test_the_code_shown_submits_the_same_job(
         assert (tmp_path / "result" / "shapes.npz").is_file()
 
 
+@pytest.mark.parametrize(("output", "file"), [("glb", "shapes.glb"), ("csv", "shapes.npz")])
+def test_the_code_shown_downloads_a_file_that_the_job_writes(
+    page: Page, url: str, small: dict[str, bytes], output: str, file: str
+) -> None:
+    options = {"method": "pseudo_inverse", "outputs": [output]}
+    sent = {"tracks": small[TRACKS]}
+    job = httpx.post(f"{url}/v1/jobs", files=sent, data={"options": json.dumps(options)}, timeout=60).json()
+    page.goto(f"{url}/#job={job['id']}")
+    page.get_by_role("button", name="curl", exact=True).click()
+    expect(page.get_by_role("region", name="Use from code").locator("code")).to_contain_text(f"artifacts/{file}")
+
+
 @pytest.mark.long
 @pytest.mark.usefixtures("front")
 def test_a_dense_result_plays_within_time_and_memory(page: Page, tmp_path: Path) -> None:

@@ -95,8 +95,11 @@ def _frame(result: Result, frame: int) -> tuple[Floats, Floats | None, Floats | 
 
 def _header_lines(result: Result) -> list[str]:
     y_axis = "up" if result.options.axes == "viewer" else result.y_axis
-    depth = "away from" if y_axis == "down" else "towards"
-    lines = [f"x right, y {y_axis}, z {depth} the first camera; unit of the tracks"]
+    if np.allclose(result.solution.camera.rotations[0], np.eye(3)):
+        axes = f"x right, y {y_axis}, z {'away from' if y_axis == 'down' else 'towards'} the first camera"
+    else:
+        axes = "world axes of the cameras" + ("" if y_axis == result.y_axis else ", y and z reversed")
+    lines = [f"{axes}; unit of the tracks"]
     if result.painting is not None:
         painting = result.painting
         lines.append(

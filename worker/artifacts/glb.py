@@ -78,14 +78,6 @@ class Buffer:
         self.bytes += -(-count * stride // 4) * 4
         return len(self.accessors) - 1
 
-    def add_zeros(self, count: int, *, normalised: bool) -> int:
-        """Append an accessor of zeros `(count, 3)`, which takes no bytes: signed bytes if `normalised`, else single precision."""
-        kind = COMPONENTS["int8" if normalised else "float32"]
-        self.accessors.append({"componentType": kind, "count": count, "type": "VEC3"})
-        if normalised:
-            self.accessors[-1]["normalized"] = True
-        return len(self.accessors) - 1
-
     def attach(self, content: bytes) -> int:
         """Append a file as a buffer view; return the view's index."""
         self.views.append({"buffer": 0, "byteOffset": self.bytes, "byteLength": len(content)})
@@ -231,7 +223,10 @@ def _targets(
         if normals is not None:
             if normals(index) is None:
                 # Without NORMAL here, three.js would use the base normals as the displacement.
-                zeros = buffer.add_zeros(len(animation.base), normalised=quantized) if zeros is None else zeros
+                if zeros is None:
+                    # Stored, because Assimp and VTK refuse accessors without data, which glTF allows.
+                    still = np.zeros((len(animation.base), 3), np.int8 if quantized else np.float32)
+                    zeros = buffer.add(still, target=VERTICES, normalised=quantized)
                 entry["NORMAL"] = zeros
             else:
                 entry["NORMAL"] = buffer.add(

@@ -5,7 +5,7 @@ import { button, fill, h, say } from "./dom";
 import { follow } from "./events";
 import { newer, progressed } from "./news";
 import { explained } from "./refusal";
-import { type Job, type Progress, isFinal } from "./types";
+import { type Job, type Progress, isFinal, ofFilm } from "./types";
 import { badge, headline, verdictOf } from "./verdict";
 import { STATUS_WORDS, ago, count, percent, title } from "./words";
 
@@ -168,7 +168,7 @@ export class JobList {
     const seen = job.interpretation;
     say(row.name, title(job));
     const sizes = [seen.num_frames > 0 && count(seen.num_frames, "frame"), seen.num_points > 0 && count(seen.num_points, "point")];
-    const about = [seen.mesh_source === "film" && "film", ...sizes, ago(job.created_at)].filter(Boolean).join(", ");
+    const about = [ofFilm(job) && "film", ...sizes, ago(job.created_at)].filter(Boolean).join(", ");
     say(row.about, about);
     const verdict = verdictOf(job);
     fill(row.status, verdict ? headline(verdict, job) : place(job), () => [verdict ? badge(verdict, job) : place(job)]);

@@ -6,7 +6,7 @@
 import { h, say } from "./dom";
 import { firstFrame, servedFrame } from "./film";
 import { sentFile } from "./sent";
-import type { Job } from "./types";
+import { type Job, ofFilm } from "./types";
 
 type Followed = NonNullable<NonNullable<Job["progress"]>["followed"]>;
 
@@ -29,7 +29,7 @@ export class LiveTracks {
   /** Update the picture from a record of the job. */
   show(job: Job): void {
     const { status, progress } = job;
-    const pending = job.interpretation.mesh_source === "film" && (status === "queued" || status === "running");
+    const pending = ofFilm(job) && (status === "queued" || status === "running");
     this.element.hidden = !pending;
     if (!pending) return this.close();
     if (!this.started) {

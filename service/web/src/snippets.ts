@@ -4,7 +4,7 @@ import { getOptions } from "./api";
 import { button, fill, h } from "./dom";
 import { chosen } from "./options";
 import { sentNames } from "./sent";
-import type { Job, Schema } from "./types";
+import { type Job, type Schema, ofFilm } from "./types";
 
 type Language = "Python" | "Shell" | "curl";
 
@@ -97,8 +97,6 @@ function parts(job: Job): [FormPart, ...FormPart[]] {
   return found;
 }
 
-const ofFilm = (job: Job): boolean => job.interpretation.mesh_source === "film";
-
 /** Return the code for a job. */
 function snippet(job: Job, options: Given, language: Language, url: string): string {
   if (language === "Python") return python(job, options, url);
@@ -141,10 +139,11 @@ function curl(job: Job, chosen: Given, url: string): string {
     ...(job.name ? [`-F ${quote(`name=${job.name}`)}`] : []),
     ...(chosen.length > 0 ? [`-F ${quote(`options=${JSON.stringify(Object.fromEntries(chosen))}`)}`] : []),
   ];
+  const animated = (job.options["outputs"] as string[]).includes("glb");
   return (
     `${[`curl ${quote(`${url}/v1/jobs`)}`, ...fields].join(" \\\n  ")}\n\n` +
-    `# this job's record, and its animated mesh\n` +
+    `# this job's record, and its ${animated ? "animated mesh" : "arrays"}\n` +
     `curl ${quote(`${url}/v1/jobs/${job.id}`)}\n` +
-    `curl --fail -O ${quote(`${url}/v1/jobs/${job.id}/artifacts/shapes.glb`)}\n`
+    `curl --fail -O ${quote(`${url}/v1/jobs/${job.id}/artifacts/shapes.${animated ? "glb" : "npz"}`)}\n`
   );
 }

@@ -51,3 +51,8 @@ export type Part = (typeof PARTS)[number];
 export function isFinal(status: Status): boolean {
   return status === "succeeded" || status === "failed" || status === "cancelled";
 }
+
+/** Whether a job was submitted as a film. A file of `pliant track` has the film's mesh, too, but contains tracks. */
+export function ofFilm(job: Job): boolean {
+  return job.interpretation.format.startsWith("film (");
+}

@@ -304,3 +304,15 @@ def test_the_result_of_a_film_shows_its_contact_sheet(filming: Page, url: str, f
     assert files.all_inner_texts() == ["contact_sheet.jpg", "tracks.npz"]
     expect(filming.get_by_role("region", name="Use from code")).to_contain_text('film="film.mp4"')  # sent elsewhere
     expect(filming.get_by_role("region", name="Use from code")).to_contain_text('region="mask.png"')
+
+
+def test_tracks_of_a_film_are_not_taken_for_a_film(filming: Page, url: str, finished: str) -> None:
+    record = film_record(url, finished)
+    record["interpretation"] |= {"format": "Pliant", "num_points": 30}
+    record["progress"]["stage"] = "cameras"
+    answer_with(filming, record)
+    filming.goto("about:blank")
+    filming.goto(f"{url}/#job={finished}")
+    expect(filming.get_by_role("region", name="Use from code")).to_contain_text('submit(\n    "tracks.npz"')
+    expect(filming.get_by_role("button", name="Cancel")).to_be_visible()
+    expect(filming.get_by_text("The points appear as soon as they are tracked.")).to_be_hidden()

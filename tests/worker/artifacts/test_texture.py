@@ -146,6 +146,16 @@ def test_usdz_contains_the_material_and_the_picture(tmp_path: Path) -> None:
     assert [error.GetMessage() for error in found] == []
 
 
+def test_usd_points_take_their_colours_from_the_picture(tmp_path: Path) -> None:
+    from pxr import Usd, UsdGeom
+
+    made = make_result(mesh="none", texture=True, outputs="usd")
+    stage = Usd.Stage.Open(str(write(tmp_path, made)["shapes.usdc"]))
+    colours = UsdGeom.PrimvarsAPI(stage.GetDefaultPrim()).GetPrimvar("displayColor")
+    assert colours.GetInterpolation() == UsdGeom.Tokens.vertex
+    np.testing.assert_allclose(colours.Get(), linear(expected_colours(made[0].texture)), atol=0.02)
+
+
 def test_a_failed_usdz_write_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from pxr import UsdUtils
 

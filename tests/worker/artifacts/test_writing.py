@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -275,6 +276,25 @@ def test_ply_zip_holds_every_frame(tmp_path: Path) -> None:
             np.testing.assert_array_equal(points, shape.astype(np.float32))
             assert inputs.mesh is not None
             np.testing.assert_array_equal(np.stack(content["face"]["vertex_indices"]), inputs.mesh.faces)
+
+
+@pytest.mark.parametrize(
+    ("axes", "first", "stated"),
+    [
+        ("viewer", np.eye(3), "x right, y up, z towards the first camera"),
+        ("tracks", np.eye(3), "x right, y down, z away from the first camera"),
+        ("viewer", np.diag([1.0, -1, -1]), "world axes of the cameras, y and z reversed"),
+        ("tracks", np.diag([1.0, -1, -1]), "world axes of the cameras"),
+    ],
+)
+def test_ply_and_obj_state_their_axes(tmp_path: Path, axes: str, first: np.ndarray, stated: str) -> None:
+    """Known cameras refer to a world of their own, which need not be that of the first camera."""
+    inputs, solution, options = make_result(outputs="ply,obj", axes=axes)
+    camera = replace(solution.camera, rotations=first @ solution.camera.rotations)
+    files = write(tmp_path, (inputs, replace(solution, camera=camera), options))
+    for kind, comment in (("ply", "comment"), ("obj", "#")):
+        with zipfile.ZipFile(files[f"shapes_{kind}.zip"]) as archive:
+            assert f"\n{comment} {stated}; unit of the tracks\n".encode() in b"\n" + archive.read(f"frame_00000.{kind}")
 
 
 def test_equal_results_give_identical_files(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import IO, Any
 import numpy as np
 from pliant.solver.mesh import triangles_of
 from pliant.worker.artifacts.colours import linear
-from pliant.worker.artifacts.geometry import vertex_normals, viewer_scale
+from pliant.worker.artifacts.geometry import Floats, vertex_normals, viewer_scale
 from pliant.worker.artifacts.names import identifier, object_name
 from pliant.worker.artifacts.result import Result
 from pliant.worker.artifacts.scenes.by_path import path_beside
@@ -58,7 +58,7 @@ def write_usdz(result: Result, file: IO[bytes], on_progress: Callable[[float], N
 
 
 def _build(path: Path, result: Result, on_progress: Callable[[float], None]) -> None:
-    from pxr import Sdf, Usd, UsdGeom, Vt
+    from pxr import Usd, Vt
 
     stage = Usd.Stage.CreateNew(str(path))
     _describe_stage(stage, result)
@@ -66,8 +66,7 @@ def _build(path: Path, result: Result, on_progress: Callable[[float], None]) -> 
     stage.SetDefaultPrim(shape.GetPrim())
     points, extent = shape.CreatePointsAttr(), shape.CreateExtentAttr()
     moving = result.options.normals == "animated" and len(result.faces) > 0
-    painted, kind = result.painting, Sdf.ValueTypeNames.Color3fArray
-    painting = UsdGeom.PrimvarsAPI(shape)
+    painted = result.painting
     frames = len(result.solution.shapes)
     for frame, code in enumerate(result.time_codes.tolist()):
         standing = result.standing(frame)
@@ -78,8 +77,7 @@ def _build(path: Path, result: Result, on_progress: Callable[[float], None]) -> 
             normals = vertex_normals(standing, triangles_of(result.faces))
             shape.CreateNormalsAttr().Set(Vt.Vec3fArray.FromNumpy(normals), code)
         if painted is not None:
-            colours = painting.CreatePrimvar("displayColor", kind, UsdGeom.Tokens.vertex)
-            colours.Set(Vt.Vec3fArray.FromNumpy(linear(painted.frame(frame)).astype(np.float32)), code)
+            _paint(shape, painted.frame(frame), code)
         on_progress((frame + 1) / frames)
     stage.GetRootLayer().Save()
 
@@ -98,7 +96,7 @@ def _describe_stage(stage: Any, result: Result) -> None:
 
 def _define(stage: Any, result: Result) -> Any:
     """Return the static prim: a mesh with faces, or points, scaled to a suitable size for viewers."""
-    from pxr import Gf, UsdGeom, Vt
+    from pxr import Gf, Usd, UsdGeom, Vt
 
     scale = viewer_scale(result.solution.shapes)
     faces = result.faces
@@ -111,6 +109,8 @@ def _define(stage: Any, result: Result) -> Any:
         width = float(np.linalg.norm(high - low) / np.sqrt(result.solution.shapes.shape[1])) / 4
         shape.CreateWidthsAttr(Vt.FloatArray([width]))
         shape.SetWidthsInterpolation(UsdGeom.Tokens.constant)
+        if result.picture_colours is not None:
+            _paint(shape, result.picture_colours, Usd.TimeCode.Default())
         return shape
     shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), faces.shape[1], np.int32)))
     shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces.reshape(-1))))
@@ -120,6 +120,16 @@ def _define(stage: Any, result: Result) -> Any:
     if result.texture is not None:
         _put_picture(stage, shape, result.texture)
     return shape
+
+
+def _paint(shape: Any, colours: Floats, code: Any) -> None:
+    """Colour the points by `(P, 3)`, sRGB, at a time code."""
+    from pxr import Sdf, UsdGeom, Vt
+
+    primvar = UsdGeom.PrimvarsAPI(shape).CreatePrimvar(
+        "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex
+    )
+    primvar.Set(Vt.Vec3fArray.FromNumpy(linear(colours).astype(np.float32)), code)
 
 
 def _put_picture(stage: Any, shape: Any, texture: Texture) -> None:
