@@ -1,7 +1,7 @@
 """Generate the synchronous client (client/_sync) from the asynchronous one (client/_async): `make client`.
 
 `unasync` rewrites the names and removes `async` and `await`; ruff sorts the imports and formats. The result is committed, and
-tests/client/test_generated.py compares it with a new run. Needs the `check` extra.
+tests/client/test_generated.py compares it with a new run. Needs the extras `test` and `check`.
 """
 
 from __future__ import annotations

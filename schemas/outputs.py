@@ -12,7 +12,7 @@ class OutputRequest(Chosen):
     """Files to write from a stored result. Options that are null keep the job's values."""
 
     outputs: Annotated[Outputs, Field(min_length=1)] = Field(
-        description="Files to write: glb, ply, obj, usd, abc, mdd, mat, csv; see the option `outputs` of a job."
+        description="Files to write; see the option `outputs` of a job."
     )
     fps: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] | None = Field(
         default=None, description="Frames per second of the written animation; null: as in the job."

@@ -20,7 +20,7 @@ from pliant.schemas.job import Problem
 from pliant.schemas.option_faults import option_fault, shown
 from pliant.schemas.problems import ProblemCode, find_code
 from pliant.schemas.validation import expectation
-from pliant.worker.errors import WorkerError
+from pliant.worker.errors import QuotaExceeded, WorkerError
 from pliant.worker.formats import InvalidInput
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
@@ -122,7 +122,7 @@ def of_error(error: WorkerError | InvalidInput) -> ProblemResponse:
     if status is None:
         status = 422 if isinstance(error, Invalid) else 500
     after = getattr(error, "retry_after", None)
-    again = {"retryable": error.retryable} if isinstance(error, WorkerError) else {}
+    again = {"retryable": error.retryable} if isinstance(error, QuotaExceeded) else {}
     problem = Problem.of(error.code, status, detail=str(error), **again, **members_of(error))
     return ProblemResponse(problem, headers=None if after is None else {"Retry-After": str(after)})
 

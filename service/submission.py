@@ -240,9 +240,9 @@ class ReadInputs:
 
 
 def read_form(
-    form: Form, options: Options, limits: Limits, *, films: FilmBounds, target: Path | None, picture: bool = False
+    form: Form, options: Options, limits: Limits, *, films: FilmBounds, target: Path, picture: bool = False
 ) -> ReadInputs:
-    """Read, check and interpret the files of a form, and store them if a target is given. Blocks; call it on a thread.
+    """Read, check and interpret the files of a form, and store them in the file `target`. Blocks; call it on a thread.
 
     A film is only opened, not tracked; with `picture`, its first frame is returned, too.
 
@@ -291,7 +291,7 @@ def _check_film_parts(form: Form) -> None:
         )
 
 
-def _read_film(form: Form, options: Options, bounds: FilmBounds, target: Path | None, *, picture: bool) -> ReadInputs:
+def _read_film(form: Form, options: Options, bounds: FilmBounds, target: Path, *, picture: bool) -> ReadInputs:
     region = form.files.get("region")
     source = FilmSource(
         form.files["film"].path, None if region is None else region.path, film_name=form.files["film"].name or "the film",
@@ -299,8 +299,7 @@ def _read_film(form: Form, options: Options, bounds: FilmBounds, target: Path | 
         own_rate="fps" in options.model_fields_set,
     )  # fmt: skip
     read = read_film(source, options, bounds, picture=picture)
-    if target is not None:
-        save_source(source, read.interpretation, target)
+    save_source(source, read.interpretation, target)
     return ReadInputs(read.interpretation, read.options, read.facts.first_frame or None)
 
 

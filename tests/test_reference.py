@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import inspect
 import re
 import tomllib
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
+from typing import get_args
 
 import pytest
 from pliant import client
-from pliant.cli import app
+from pliant.cli import app, jobs
 from pliant.cli.exits import Exit
 from pliant.schemas.job import Job
-from pliant.schemas.options import Options
+from pliant.schemas.options import Options, Output
 from pliant.schemas.problems import ProblemCode
 from pliant.service import metrics
 from pliant.service.settings import ServiceSettings
@@ -139,6 +141,15 @@ def test_every_option_is_generated_with_its_default(generate: ModuleType) -> Non
     assert "Type: number, ≥ 1e-9, ≤ 1,000 or null." in text
     assert "Type: boolean. Default: `true`." in text
     assert "Type: list of pairs of numbers or null." in text
+
+
+def test_every_output_is_documented_and_offered() -> None:
+    table = (REFERENCE / "artifacts.md").read_text(encoding="utf-8").partition("\n## ")[0]
+    assert sorted(re.findall(r"^\| `(\w+)`(?: \(default\))? \| `", table, re.MULTILINE)) == sorted(get_args(Output))
+    more_files = (ROOT / "service" / "web" / "src" / "afterwards.ts").read_text(encoding="utf-8")
+    assert sorted(re.findall(r'^  \["(\w+)", "', more_files, re.MULTILINE)) == sorted(get_args(Output))
+    for text in (inspect.getsource(jobs.result), client.Client.make_outputs.__doc__ or ""):
+        assert [name for name in get_args(Output) if re.search(rf"\b{name}\b", text) is None] == []
 
 
 def test_groups_of_options_leave_the_anchors_to_the_options(generate: ModuleType) -> None:

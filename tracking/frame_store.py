@@ -37,9 +37,6 @@ class FrameStore:
         self._file.close()
         self._cache.clear()
 
-    def __len__(self) -> int:
-        return len(self._places)
-
     def append(self, frame: Grey) -> None:
         """Add a grey frame, shape `(H, W)`, dtype uint8."""
         # Without a search for repetitions, which films lack, packing takes a quarter less time and a tenth less space.

@@ -1,6 +1,6 @@
 """Errors of the worker package; `WorkerError` is the base of all.
 
-Each error has a stable `code`, a message that is a complete sentence, and a flag `retryable`.
+Each error has a stable `code` and a message that is a complete sentence.
 """
 
 from __future__ import annotations
@@ -16,14 +16,11 @@ class WorkerError(Picklable):
     ----------
     code : str
         Stable machine-readable name.
-    retryable : bool
-        True if the same request may succeed later.
     retry_after : int or None
         Seconds to wait before the next attempt.
     """
 
     code = "worker_error"
-    retryable = False
     retry_after: int | None = None
 
 
@@ -143,7 +140,6 @@ class TooManyUploads(WorkerError):
     """The owner's limit on uploads is reached."""
 
     code = "too_many_uploads"
-    retryable = True
 
     def __init__(self, most: int) -> None:
         super().__init__(
@@ -173,7 +169,6 @@ class TooManyQueued(WorkerError):
     """The owner's limit on queued jobs is reached."""
 
     code = "too_many_queued"
-    retryable = True
     retry_after = 10
 
     def __init__(self, limit: int) -> None:
@@ -183,10 +178,9 @@ class TooManyQueued(WorkerError):
 
 
 class QuotaExceeded(WorkerError):
-    """A job or an upload does not fit into the disk quota beside the others, or is larger than the quota."""
+    """A job or an upload does not fit into the disk quota beside the others, or is larger than the quota, which is not `retryable`."""
 
     code = "quota_exceeded"
-    retryable = True
 
     def __init__(self, *, used: int, quota: int, needed: int) -> None:
         self.retryable = needed <= quota
@@ -207,7 +201,6 @@ class StoreUnavailable(WorkerError):
     """Redis or the blob store does not answer, or is full."""
 
     code = "store_unavailable"
-    retryable = True
     retry_after = 2
 
     def __init__(self, what: str, *, reason: str) -> None:
@@ -264,7 +257,6 @@ class TimedOut(WorkerError):
     """A reconstruction took longer than its option `time_limit` allows."""
 
     code = "timed_out"
-    retryable = True
 
     def __init__(self, limit: float) -> None:
         super().__init__(

@@ -58,11 +58,11 @@ def example_file(name: str, file: str) -> bytes:
     UnknownExample
         There is no such example, or it has no such file.
     """
-    if (name, file) == (example_film.NAME, example_film.FILE) and example_film.available():
+    films = [f"{example_film.NAME}/{example_film.FILE}"] if example_film.available() else []
+    if f"{name}/{file}" in films:
         return example_film.film()
     example = EXAMPLES.get(name)
     if example is None or file not in (listed for _, listed in example.files):
-        raise UnknownExample(
-            name, file, known=[f"{one.name}/{listed}" for one in EXAMPLES.values() for _, listed in one.files]
-        )
+        known = [f"{one.name}/{listed}" for one in EXAMPLES.values() for _, listed in one.files]
+        raise UnknownExample(name, file, known=[*known, *films])
     return WRITERS[file](example.make())

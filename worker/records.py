@@ -110,7 +110,7 @@ class Stored(BaseModel):
     @property
     def sort_key(self) -> str:
         """Order of creation, ties broken by id."""
-        return f"{int(self.job.created_at.timestamp() * 1000):014d}:{self.job.id}"
+        return f"{milliseconds(self.job.created_at):014d}:{self.job.id}"
 
 
 class Event(NamedTuple):

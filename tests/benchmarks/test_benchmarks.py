@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +18,6 @@ from pliant.solver.tracks.normalization import normalize
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parent.parent.parent
-
-
-@pytest.fixture
-def bench(monkeypatch):
-    """Return a function that imports a module of the benchmarks from the root of the repository, as they do."""
-    monkeypatch.syspath_prepend(str(ROOT))
-    return lambda name: import_module(f"benchmarks.{name}")
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:

@@ -3,21 +3,10 @@
 from __future__ import annotations
 
 import json
-from importlib import import_module
-from pathlib import Path
 
 import numpy as np
 import pytest
 from pliant.solver import Tracks
-
-ROOT = Path(__file__).parent.parent.parent
-
-
-@pytest.fixture
-def bench(monkeypatch):
-    """Return a function that imports a module of the benchmarks from the root of the repository, as they do."""
-    monkeypatch.syspath_prepend(str(ROOT))
-    return lambda name: import_module(f"benchmarks.{name}")
 
 
 def standing(frames: int = 60, points: int = 80) -> Tracks:

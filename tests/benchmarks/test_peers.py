@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pliant.solver import Tracks
 from pliant.solver.gallery import sphere
-
-ROOT = Path(__file__).parent.parent.parent
 
 FLAT = """
 from scipy.io import loadmat, savemat
@@ -22,13 +19,6 @@ S[0::3], S[1::3], S[2::3] = W[0::2], W[1::2], {depth}
 savemat("shapes.mat", {{"S": S, "seconds": 1.25}})
 """
 """A stand-in for Octave that returns shapes of constant depth."""
-
-
-@pytest.fixture
-def bench(monkeypatch):
-    """Return a function that imports a module of the benchmarks from the root of the repository, as they do."""
-    monkeypatch.syspath_prepend(str(ROOT))
-    return lambda name: import_module(f"benchmarks.{name}")
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +13,6 @@ import pytest
 from holding import hold
 
 ROOT = Path(__file__).parent.parent.parent
-
-
-@pytest.fixture
-def bench(monkeypatch):
-    """Return a function that imports a module of the benchmarks from the root of the repository, as they do."""
-    monkeypatch.syspath_prepend(str(ROOT))
-    return lambda name: import_module(f"benchmarks.{name}")
 
 
 def speed(*arguments: str) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +10,6 @@ import pytest
 from scipy.stats import norm
 
 from benchmarks.sequences import rolled_sheet
-
-ROOT = Path(__file__).parent.parent.parent
-
-
-@pytest.fixture
-def bench(monkeypatch):
-    """Return a function that imports a module of the benchmarks from the root of the repository, as they do."""
-    monkeypatch.syspath_prepend(str(ROOT))
-    return lambda name: import_module(f"benchmarks.{name}")
 
 
 def solve_of(name: str, *, too_small: float, kind: str = "clean", count: int = 99) -> dict:

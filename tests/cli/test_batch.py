@@ -29,14 +29,6 @@ def service() -> InMemoryService:
 
 
 @pytest.fixture
-def run(service: InMemoryService, monkeypatch: pytest.MonkeyPatch) -> Run:
-    for name in ("PLIANT_URL", "PLIANT_TOKEN"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("COLUMNS", "200")
-    return lambda *arguments: CliRunner().invoke(app, [str(each) for each in arguments], obj=Session(transport=service))
-
-
-@pytest.fixture
 def takes(tmp_path: Path) -> Path:
     folder = tmp_path / "takes"
     folder.mkdir()

@@ -38,18 +38,6 @@ def endless(run: Run, service: InMemoryService, tracks: Path) -> None:
 
 
 @pytest.fixture
-def run(service: InMemoryService, monkeypatch: pytest.MonkeyPatch) -> Run:
-    for name in ("PLIANT_URL", "PLIANT_TOKEN"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("COLUMNS", "200")
-
-    def run(*arguments: object) -> Result:
-        return CliRunner().invoke(app, [str(each) for each in arguments], obj=Session(transport=service))
-
-    return run
-
-
-@pytest.fixture
 def tracks(tmp_path: Path) -> Path:
     path = tmp_path / "tracks.npz"
     np.savez(path, tracks=np.random.default_rng(0).normal(size=(5, 12, 2)))

@@ -35,14 +35,6 @@ def service() -> InMemoryService:
 
 
 @pytest.fixture
-def run(service: InMemoryService, monkeypatch: pytest.MonkeyPatch) -> Run:
-    for name in ("PLIANT_URL", "PLIANT_TOKEN"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("COLUMNS", "200")
-    return lambda *arguments: CliRunner().invoke(app, [str(each) for each in arguments], obj=Session(transport=service))
-
-
-@pytest.fixture
 def job(run: Run, tmp_path: Path) -> str:
     np.savez(tmp_path / "tracks.npz", tracks=np.random.default_rng(0).normal(size=(5, 12, 2)))
     ran = run("submit", tmp_path / "tracks.npz", "--wait", "--json", "-n", "take", "-O", "stride=2")

@@ -23,7 +23,7 @@ MORE_SEEDS = (*sorted(set(range(24)) - {*SEEDS, *SLOW_SEEDS}), 45, 91)
 
 @pytest.mark.slow
 def test_points_dropped_by_completion_do_not_break_the_solve() -> None:
-    tracks = gallery.sphere(5, 20).tracks  # completion keeps 16 points, which used to be compared with all 20
+    tracks = gallery.sphere(5, 20).tracks  # completion keeps 16 points, fewer than the 20 given
     assert np.isfinite(solve(tracks, settings=Settings(basis_size=1)).shapes).all()
 
 

@@ -10,6 +10,10 @@ from pathlib import Path
 import pytest
 from pliant.schemas.job import Interpretation, Job
 from pliant.schemas.options import Options
+from pliant.worker.formats import Limits
+from pliant.worker.formats.reading import containers
+from pliant.worker.formats.reading.parsers import PARSERS
+from pliant.worker.formats.records import Arrays
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
 from pliant.worker.processes.valkey import Valkey
@@ -120,3 +124,14 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         pytest.skip("may not mount a small file system here")
     yield disk
     subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parse in this process, to save the half second that a child takes to start; formats/test_containers.py starts one."""
+
+    def parse_here(parser: str, path: Path, *, field: str, limits: Limits) -> Arrays:
+        with path.open("rb") as stream:
+            return PARSERS[parser](stream, field=field, limits=limits)
+
+    monkeypatch.setattr(containers, "parse_in_sandbox", parse_here)

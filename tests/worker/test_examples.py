@@ -42,7 +42,7 @@ def test_an_example_file_has_the_same_bytes_every_time() -> None:
     ("name", "file"), [("absent", "tracks.npz"), ("face", "absent.npz"), ("face", "../tracks.npz")]
 )
 def test_the_error_for_an_unknown_example_lists_the_known_ones(name: str, file: str) -> None:
-    with pytest.raises(UnknownExample, match=r"There are: face/tracks\.npz, face/mesh\.npz"):
+    with pytest.raises(UnknownExample, match=r"There are: face/tracks\.npz, face/mesh\.npz.*, film/face\.webm\."):
         example_file(name, file)
 
 

@@ -44,6 +44,7 @@ from pliant.solver import Mesh, Solution, Tracks
 from pliant.solver.evaluation.alignment import align
 from pliant.solver.evaluation.trust import size_of
 from pliant.solver.mesh import triangles_of
+from pliant.worker.artifacts.geometry import Floats
 from pliant.worker.formats.texture import Texture
 
 NAME = "preview.bin"
@@ -59,8 +60,6 @@ LEAST_TRUE = 3
 """Minimum number of points with truth for an alignment."""
 MOST_OBSERVATIONS = 16_000_000
 """Number of points × frames (96 MB of positions) above which only every n-th frame is written."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,7 +47,7 @@ def reconstruct_film(
     threads: int = 1,
     bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
     memory: int = 0,
-    on_progress: Callable[[Progress], None] | None = None,
+    on_progress: Callable[[Progress], None] = silent,
     on_warnings: OnWarnings | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Finished:
@@ -58,7 +58,7 @@ def reconstruct_film(
     `on_warnings` is that of `track_film`.
     """
     kinds_for(options)
-    reporter = Reporter(on_progress if on_progress is not None else silent, shares=FILM_SHARES)
+    reporter = Reporter(on_progress, shares=FILM_SHARES)
     halt, pace = StopCondition(should_stop, options.time_limit), MachinePace()
     with reporter.ticking():
         reporter.part("track", 0.0)

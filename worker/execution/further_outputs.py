@@ -39,7 +39,7 @@ def write_further(
     job: Job,
     directory: Path,
     *,
-    on_progress: Callable[[Progress], None] | None = None,
+    on_progress: Callable[[Progress], None] = silent,
     should_stop: Callable[[], bool] | None = None,
 ) -> Finished:
     """Write the files requested by a job's options from a stored result.
@@ -55,7 +55,7 @@ def write_further(
         Code damaged_file: a stored file cannot be read back.
     """
     options, halt = job.options, StopCondition(should_stop, job.options.time_limit)
-    reporter = Reporter(on_progress if on_progress is not None else silent, shares=SHARES)
+    reporter = Reporter(on_progress, shares=SHARES)
     reporter.part("loading", 0.0)
     inputs = _inputs(inputs_file, job)
     solution = read_solution(result_file, y_up=inputs.interpretation.y_axis == "up")

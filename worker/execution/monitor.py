@@ -148,25 +148,25 @@ def finalize(watch: Watch, *, status: int, peak: int, deadline: RetryDeadline) -
     StoreUnavailable
         The store does not answer.
     """
-    change = _verdict(watch, status=status, peak=peak)
+    change = _outcome(watch, status=status, peak=peak)
     sentence = f"Ended by the worker: {watch.reason}." if watch.reason is not None else how_it_ended(status)
     words = [*dated(sentence), *output_tail(watch.settings, watch.attempt_id)]
 
-    def record_verdict() -> Stored:
+    def record_outcome() -> Stored:
         change(watch.records.get(watch.id))  # raises if the outcome is recorded already
         watch.records.append_log(watch.id, words)
         words.clear()
         return watch.records.update(watch.id, change)
 
     try:
-        settled = deadline.retry(record_verdict)
+        settled = deadline.retry(record_outcome)
     except (StaleAttempt, UnknownJob):
         return None
     logger.warning("job %s: %s", watch.id, sentence, extra={"job": watch.id})
     return settled
 
 
-def _verdict(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stored]:
+def _outcome(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stored]:
     settings, attempt_id, now = watch.settings, watch.attempt_id, datetime.now(UTC)
 
     def change(stored: Stored) -> Stored:

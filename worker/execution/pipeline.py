@@ -24,13 +24,18 @@ EXPORT_SECONDS = 1.5e-7
 """Seconds per frame and point to write a file whose `share` is 1, measured on a face of 99 frames and 3,000 points."""
 
 
+def silent(progress: Progress) -> None:
+    """Ignore the progress."""
+    del progress
+
+
 def reconstruct(
     inputs: Inputs,
     options: Options,
     directory: Path,
     *,
     name: str = "",
-    on_progress: Callable[[Progress], None] | None = None,
+    on_progress: Callable[[Progress], None] = silent,
     should_stop: Callable[[], bool] | None = None,
     solver: Callable[..., Solution] | None = None,
 ) -> Finished:
@@ -49,7 +54,7 @@ def reconstruct(
     """
     # Reject files that cannot be written before computing anything.
     kinds_for(options, size=(inputs.tracks.num_frames, inputs.tracks.num_points))
-    reporter = Reporter(on_progress if on_progress is not None else silent)
+    reporter = Reporter(on_progress)
     halt = StopCondition(should_stop, options.time_limit)
     with reporter.ticking():
         return solve_and_write(inputs, options, directory, name=name, reporter=reporter, halt=halt, solver=solver)
@@ -155,8 +160,3 @@ def _report_step(reporter: Reporter, step: Step) -> None:
         residual=step.residual,
         seconds_left=step.seconds_left,
     )
-
-
-def silent(progress: Progress) -> None:
-    """Ignore the progress."""
-    del progress

@@ -1,11 +1,7 @@
 """Errors of the readers.
 
-    pliant.solver.InvalidInput      base: every error has code, field, expected, got and hint
-    └── AmbiguousInput              several interpretations fit; lists them as choices
-
-Codes of this package: ambiguous_coordinates, ambiguous_layout, damaged_file, degenerate_face, duplicate_member, duplicate_observation,
-empty_file, index_out_of_range, member_name, missing_array, missing_image_size, no_frames_left, object_array, out_of_range, pickle_refused,
-too_large, too_slow, transposed_grid, unknown_format, unsupported_feature, vertex_count_mismatch, wrong_shape, wrong_type.
+pliant.solver.InvalidInput      base: every error has code, field, expected, got and hint
+└── AmbiguousInput              several interpretations fit; lists them as choices
 """
 
 from __future__ import annotations

@@ -62,9 +62,9 @@ def store_inputs(
     rotations: Path | None = None,
     options: Options,
     limits: Limits = Limits(),  # noqa: B008 - frozen
-    target: Path | None,
+    target: Path,
 ) -> Interpretation:
-    """Read, check and interpret the files of one job as `read_inputs` does; store them in canonical form if there is a target.
+    """Read, check and interpret the files of one job as `read_inputs` does; store them in canonical form in the file `target`.
 
     Raises
     ------
@@ -101,10 +101,9 @@ def _check_here(path: Path, options: Options) -> None:
     check_options(inputs.tracks, inputs.mesh, inputs.cameras, options, y_axis=inputs.interpretation.y_axis)
 
 
-def _here(parts: dict[str, Any], options: Options, limits: Limits, target: Path | None) -> Interpretation:
+def _here(parts: dict[str, Any], options: Options, limits: Limits, target: Path) -> Interpretation:
     inputs = read_inputs(**parts, options=options, limits=limits)
-    if target is not None:
-        save_inputs(inputs, target)
+    save_inputs(inputs, target)
     return inputs.interpretation
 
 
@@ -178,13 +177,12 @@ def _answer(request: dict[str, Any]) -> str:
     limits = Limits(**request["limits"])
     limit_process({resource.RLIMIT_AS: limits.read_memory})
     parts = {name: Path(part["path"]) if isinstance(part, dict) else part for name, part in request["parts"].items()}
-    target = None if request["target"] is None else Path(request["target"])
     options = Options.model_validate(request["options"])
     try:
         if STORED in parts:
             _check_here(parts[STORED], options)
             return ""
-        return _here(parts, options, limits, target).model_dump_json()
+        return _here(parts, options, limits, Path(request["target"])).model_dump_json()
     except MemoryError as error:
         raise _too_much_memory(limits) from error
 

@@ -86,7 +86,7 @@ class Queue(ABC):
 
     @abstractmethod
     def memories(self) -> dict[str, int]:
-        """Return the bytes available to a job on each of these workers, by name; workers that report none are omitted."""
+        """Return the bytes available to a job on each of these workers, by name; 0 if unknown."""
 
 
 class RedisQueue(Queue):
@@ -173,7 +173,4 @@ class RedisQueue(Queue):
         names = self.workers()
         with reachable():
             signs = self._redis.mget([alive_key(self._name, name) for name in names]) if names else []
-        stated = {
-            name: sign.decode().partition(" ")[2] for name, sign in zip(names, signs, strict=True) if sign is not None
-        }
-        return {name: int(size) for name, size in stated.items() if size.isdigit()}
+        return {name: int(sign.split()[1]) for name, sign in zip(names, signs, strict=True) if sign is not None}

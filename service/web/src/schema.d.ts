@@ -1143,7 +1143,7 @@ export interface components {
         OutputRequest: {
             /**
              * Outputs
-             * @description Files to write: glb, ply, obj, usd, abc, mdd, mat, csv; see the option `outputs` of a job.
+             * @description Files to write; see the option `outputs` of a job.
              */
             outputs: ("glb" | "ply" | "obj" | "usd" | "abc" | "mdd" | "mat" | "csv")[];
             /**

@@ -130,7 +130,6 @@ def test_an_attempt_stops_at_its_time_limit(attempt: Attempt, now: list[float]) 
 def test_a_finished_job_waits_for_an_unavailable_blob_store(
     jobs: Jobs, attempt: Attempt, now: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An outage of seconds used to discard the result of hours."""
     (tmp_path / "report.json").write_text("{}")
     artifact = Artifact(name="report.json", media_type="application/json", bytes=2, sha256="0" * 64, description="")
     finished = Finished(metrics={}, outcome="converged", sentence="Done.", warnings=(), artifacts=(artifact,))

@@ -51,7 +51,7 @@ def test_options_that_are_not_given_stay_so_in_the_isolated_reader(
         options = Options(frames="::2", **given)
         here = read_inputs(tracks=film, options=options).interpretation
         monkeypatch.setattr("pliant.worker.formats.isolated_reader.LARGE", 0)
-        assert store_inputs(tracks=film, options=options, target=None).notes == here.notes
+        assert store_inputs(tracks=film, options=options, target=tmp_path / "c.npz").notes == here.notes
         assert any("at the same fps" in note for note in here.notes) == bool(given)
 
 

@@ -11,9 +11,6 @@ from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Mesh, Tracks
 from pliant.worker.formats import Inputs, Limits, read_inputs
 from pliant.worker.formats.meshes.triangulation import triangulate
-from pliant.worker.formats.reading import containers
-from pliant.worker.formats.reading.parsers import PARSERS
-from pliant.worker.formats.records import Arrays
 
 pytestmark = pytest.mark.usefixtures("forked_readers")
 
@@ -26,12 +23,6 @@ TRIANGLES = np.concatenate([FACES[:, [0, 1, 2]], FACES[:, [0, 2, 3]]])
 def sheet() -> np.ndarray:
     y, x = np.mgrid[:ROWS, :COLUMNS].astype(float)
     return np.stack([np.stack([x + 10 + f * 0.1, y * (1 - 0.02 * f) + 10], axis=-1).reshape(P, 2) for f in range(F)])
-
-
-def parse_here(parser: str, path: Path, *, field: str, limits: Limits) -> Arrays:
-    """Call the parser in this process, to save the half second that a child takes to start."""
-    with path.open("rb") as stream:
-        return PARSERS[parser](stream, field=field, limits=limits)
 
 
 @pytest.fixture
@@ -162,10 +153,7 @@ def test_a_grid_of_points_in_random_order_or_hidden_is_accepted(tmp_path: Path) 
         ("f " + "1 " * 5000 + "\n", "damaged_file"),
     ],
 )
-def test_bad_obj_lines_are_refused(
-    tmp_path: Path, tracks: Path, text: str, code: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(containers, "parse_in_sandbox", parse_here)
+def test_bad_obj_lines_are_refused(here: None, tmp_path: Path, tracks: Path, text: str, code: str) -> None:
     (tmp_path / "m.obj").write_text(obj(FACES) + text)
     assert code_of(tracks, tmp_path / "m.obj") == code
 
@@ -236,7 +224,6 @@ def test_vertices_that_are_a_scalar_are_refused(tmp_path: Path, tracks: Path) ->
     assert code_of(tracks, tmp_path / "m.npz") == "vertex_count_mismatch"
 
 
-def test_indices_beyond_64_bits_are_refused(tmp_path: Path, tracks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(containers, "parse_in_sandbox", parse_here)
+def test_indices_beyond_64_bits_are_refused(here: None, tmp_path: Path, tracks: Path) -> None:
     (tmp_path / "m.obj").write_text(obj(FACES) + f"f 1 2 3 {10**30}\n")
     assert code_of(tracks, tmp_path / "m.obj") == "damaged_file"

@@ -13,10 +13,8 @@ import numpy as np
 import pytest
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
-from pliant.worker.formats import Inputs, Limits, load_inputs, read_inputs, save_inputs
+from pliant.worker.formats import Inputs, load_inputs, read_inputs, save_inputs
 from pliant.worker.formats.point_names import FACE, HAND, IRISES, MAX_POINT_NAME, POSE, pack, unpack
-from pliant.worker.formats.reading import containers
-from pliant.worker.formats.reading.parsers import PARSERS
 from pliant.worker.formats.reading.pose_hdf5 import strings_of
 from pliant.worker.formats.records import Arrays
 from pliant.worker.formats.tracks.interpretation import understand
@@ -26,17 +24,6 @@ POINTS = np.round(np.random.default_rng(2).uniform(20, 500, (1, P, 2)) + np.aran
 PARTS = ("Nose", "left_Ear", "right ear", "Kinn Ü", "brow", "tip")
 AXES = ("x", "y", "likelihood")
 TABLE = np.concatenate([POINTS, np.full((F, P, 1), 0.9)], axis=2).reshape(F, 3 * P)
-
-
-@pytest.fixture
-def here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Parse in this process, to save the start of a child."""
-
-    def parse_here(parser: str, path: Path, *, field: str, limits: Limits) -> Arrays:
-        with path.open("rb") as stream:
-            return PARSERS[parser](stream, field=field, limits=limits)
-
-    monkeypatch.setattr(containers, "parse_in_sandbox", parse_here)
 
 
 def read(path: Path, **options: Any) -> Inputs:

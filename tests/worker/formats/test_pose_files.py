@@ -13,26 +13,15 @@ import numpy as np
 import pytest
 from pliant.schemas.options import Options
 from pliant.worker.formats import InvalidInput, Limits, read_inputs
-from pliant.worker.formats.reading import containers
 from pliant.worker.formats.reading.parsers import PARSERS
-from pliant.worker.formats.records import Arrays
+
+pytestmark = pytest.mark.usefixtures("here")
 
 F, P = 5, 6
 NAMES = ("nose", "left_ear", "right ear", "chin", "brow", "tip")
 POINTS = np.round(np.random.default_rng(2).uniform(20, 500, (1, P, 2)) + np.arange(F)[:, None, None] * [1.5, 0.25], 2)
 SURE = np.where(np.arange(F * P).reshape(F, P) == 8, 0.1, 0.9)
 EXAMPLE = "Write it as in `frame,point,x,y` and then `0,0,312.5,200.1`, or one row a frame: `frame,nose_x,nose_y,chin_x,chin_y`."
-
-
-@pytest.fixture(autouse=True)
-def _here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Parse in this process, to save the start of a child; tests/worker/formats/test_containers.py starts one."""
-
-    def parse_here(parser: str, path: Path, *, field: str, limits: Limits) -> Arrays:
-        with path.open("rb") as stream:
-            return PARSERS[parser](stream, field=field, limits=limits)
-
-    monkeypatch.setattr(containers, "parse_in_sandbox", parse_here)
 
 
 def rows_of(*, separator: str = ",", decimal: str = ".", frame: bool = True, confidence: bool = True) -> list[str]:

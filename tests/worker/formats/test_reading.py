@@ -274,7 +274,7 @@ def test_given_cameras_are_completed_and_checked(tmp_path: Path) -> None:
 def test_visibility_larger_than_the_tracks_is_refused_before_conversion(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A file of 0.88 MB with 900 MB of zeros as visibility used to take 7.8 GB."""
+    """Converting 900 MB of zeros, a file of 0.88 MB, takes 7.8 GB."""
     monkeypatch.setattr("pliant.worker.formats.tracks.visibility._confidence", None)  # not reached
     tracks = moving_sheet(6, 4, 5)[..., :2] + 100
     arrays = {"visibility": np.ones((6, 20)), name: np.zeros((600, 2000), bool)}

@@ -191,13 +191,13 @@ def jobs(settings: Settings) -> Jobs:
     return Jobs.open(settings)
 
 
-def alive(jobs: Jobs, name: str, memory: str) -> None:
+def alive(jobs: Jobs, name: str, memory: int) -> None:
     from pliant.worker.store.connection import connect
 
     client = connect(jobs.settings.redis, decode=True)
     client.sadd(f"rq:workers:{jobs.settings.queue}", f"rq:worker:{name}")
     client.hset(f"rq:worker:{name}", "state", "busy")  # the clean-up removes names without a record
-    client.set(alive_key(jobs.settings.queue, name), f"1{memory}", ex=60)
+    client.set(alive_key(jobs.settings.queue, name), f"1 {memory}", ex=60)
     client.close()
 
 
@@ -205,13 +205,13 @@ def test_a_submission_is_checked_against_the_running_workers(jobs: Jobs, inputs_
     large, submission = interpretation(100, 100_000), Submission(options=Options())
     assert jobs.queue.memories() == {}
     jobs.submit(inputs_file, submission, interpretation=large)
-    alive(jobs, "old", "")  # an older version, which states no memory
-    alive(jobs, "small", " 500000000")
-    assert jobs.queue.memories() == {"small": 500_000_000}
+    alive(jobs, "unknown", 0)
+    alive(jobs, "small", 500_000_000)
+    assert jobs.queue.memories() == {"unknown": 0, "small": 500_000_000}
     with pytest.raises(InvalidRequest, match=r"0\.5 GB"):
         jobs.submit(inputs_file, submission, interpretation=large)
     assert jobs.count(list(Status)) == 1
-    alive(jobs, "large", " 64000000000")
+    alive(jobs, "large", 64_000_000_000)
     jobs.submit(inputs_file, submission, interpretation=large)
 
 
@@ -220,7 +220,7 @@ def test_a_worker_puts_back_a_job_that_is_too_large_for_it(settings: Settings, i
     """A larger worker is registered but does not run, so the job stays queued."""
     small = replace(settings, memory_limit=UNUSED + (1 << 30), threads=1)
     with House(small, inputs=inputs_files) as house:
-        alive(house.jobs, "large", f" {1 << 60}")
+        alive(house.jobs, "large", 1 << 60)
         big = interpretation(100, 1_000_000)
         submission = Submission(options=Options(max_reweightings=2))
         id = house.jobs.submit(house.short_inputs, submission, interpretation=big).id

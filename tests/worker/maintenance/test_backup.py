@@ -202,7 +202,6 @@ def test_a_job_deleted_during_the_backup_is_omitted(
 def test_a_backup_without_the_services_blob_store_is_refused_and_keeps_the_earlier_one(
     jobs: Jobs, sent: dict[str, str], empty: Settings, tmp_path: Path
 ) -> None:
-    """Every job was taken for deleted, and the earlier backup was emptied."""
     write_backup(jobs.settings, tmp_path / "backup")
     other = replace(jobs.settings, blob_url=(tmp_path / "other").as_uri())
     with pytest.raises(BadBackup, match=r"has lost its file jobs/.* Check that PLIANT_BLOB_URL is that of the service"):

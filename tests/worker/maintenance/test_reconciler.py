@@ -357,7 +357,6 @@ def test_a_clock_jump_of_a_year_loses_nothing(
 def test_files_stored_late_by_a_stale_attempt_are_removed(
     world: World, submit: Callable[[World], str], tmp_path: Path
 ) -> None:
-    """After 200 s without Redis, files of stale attempts used to stay until the hourly sweep."""
     id = submit(world)
     old = world.claim(id)
     world.pass_seconds(7)

@@ -114,7 +114,8 @@ def read_npz(
     Raises
     ------
     InvalidInput
-        Codes damaged_file, duplicate_member, member_name, object_array, pickle_refused, too_large, wrong_type.
+        Codes damaged_file, duplicate_member, film_as_tracks, member_name, object_array, pickle_refused, too_large, unknown_format,
+        unsupported_feature, wrong_type.
     """
     check_directory(path, field=field)
     arrays: Arrays = {}

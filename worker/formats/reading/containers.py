@@ -24,7 +24,7 @@ def read_arrays(path: Path, *, field: str, limits: Limits, wanted: Collection[st
     Raises
     ------
     InvalidInput
-        Codes unknown_format, empty_file, too_large, pickle_refused and those of the container's reader.
+        Codes empty_file and too_large, and those of `recognise` and the container's reader.
     """
     size = path.stat().st_size
     if size > limits.max_bytes:

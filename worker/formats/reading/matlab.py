@@ -33,7 +33,7 @@ def read_matlab5(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     Raises
     ------
     InvalidInput
-        Codes damaged_file, too_large, unsupported_feature.
+        Codes damaged_file, missing_array, too_large.
     """
     try:
         with warnings.catch_warnings():

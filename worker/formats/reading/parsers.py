@@ -79,7 +79,7 @@ def recognise(head: bytes, field: str) -> str:
     Raises
     ------
     InvalidInput
-        Codes unknown_format and pickle_refused.
+        Codes film_as_tracks, pickle_refused, picture_as_tracks, unknown_format.
     """
     if head.startswith(PICKLE):
         raise pickle_refusal(field)

@@ -31,7 +31,7 @@ def find_visibility(
     Raises
     ------
     InvalidInput
-        Code wrong_shape or wrong_type.
+        Codes out_of_range, wrong_shape, wrong_type.
     AmbiguousInput
         Code out_of_range: numbers above 1 that may be a mask or logits.
     """
