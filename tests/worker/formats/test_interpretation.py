@@ -60,6 +60,21 @@ def test_signed_fractions_are_detected_with_a_known_size(tmp_path: Path) -> None
     assert alone.interpretation.y_axis == "up"
 
 
+@pytest.mark.parametrize(
+    ("tracks", "coordinates", "options"),
+    [(POINTS, "pixels", {}), (POINTS, "pixels", {"image_size": "9x5"}), (UNIT, "unit", {"image_size": "9x5"})],
+)
+def test_positions_of_hidden_points_do_not_decide_on_units_and_axes(
+    tracks: np.ndarray, coordinates: str, options: dict[str, str], tmp_path: Path
+) -> None:
+    hidden = np.zeros((F, P), bool)
+    hidden[::2, ::2] = True
+    filled = np.where(hidden[..., None], -1.0, tracks)  # as trackers mark hidden points
+    got = read(tmp_path, {"tracks": filled, "visibility": ~hidden}, **options)
+    assert (got.interpretation.coordinates, got.interpretation.y_axis) == (coordinates, "down")
+    np.testing.assert_array_equal(got.tracks.points[~hidden], POINTS[~hidden])
+
+
 def test_fractions_are_detected_despite_points_outside_the_picture(tmp_path: Path) -> None:
     some = UNIT.copy()
     some[-1, :3] = [1.25, -0.5]
