@@ -12,6 +12,7 @@ import pytest
 import scipy.io
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Tracks
+from pliant.solver.gallery import face
 from pliant.worker.formats import AmbiguousInput, Inputs, Limits, read_inputs
 from pliant.worker.formats.ground_truth import as_rotations, as_shapes, unexplained
 from pliant.worker.formats.reading.pose_hdf5 import read_hdf5 as read_matlab73
@@ -73,6 +74,19 @@ def test_positions_of_hidden_points_do_not_decide_on_units_and_axes(
     got = read(tmp_path, {"tracks": filled, "visibility": ~hidden}, **options)
     assert (got.interpretation.coordinates, got.interpretation.y_axis) == (coordinates, "down")
     np.testing.assert_array_equal(got.tracks.points[~hidden], POINTS[~hidden])
+
+
+@pytest.mark.parametrize("rows", ["interleaved", "stacked"])
+def test_positions_of_hidden_points_do_not_decide_on_the_layout(rows: str) -> None:
+    points = face(40, 150).tracks.points
+    hidden = np.random.default_rng(0).random((40, 150)) < 0.3
+    filled = np.where(hidden[..., None], 0.0, points)
+    matrix = filled.transpose(0, 2, 1) if rows == "interleaved" else filled.transpose(2, 0, 1)
+    assert len(offered(refused("ambiguous_layout", {"W": matrix.reshape(80, 150)}))) == 4
+    got = understand({"W": matrix.reshape(80, 150), "MD": hidden}, Options())
+    np.testing.assert_array_equal(got.points, filled)
+    refused("ambiguous_layout", {"W": matrix.reshape(80, 150), "MD": hidden[1:]})
+    understand({"W": points.transpose(0, 2, 1).reshape(80, 150), "MD": np.ones((40, 150), bool)}, Options())
 
 
 def test_fractions_are_detected_despite_points_outside_the_picture(tmp_path: Path) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -76,8 +78,9 @@ def understand(arrays: Arrays, options: Options, *, file: Path | None = None) ->
         return _of_our_tracker(named, name, options)
     flat = flatten(name, _numeric(named[name], name))
     array, depths, named = _two_numbers(flat.array, name, dialect, named)
-    reading, notes = choose(name, array, dialect=dialect, options=options)
-    visible, how = find_visibility(named, reading, grid=flat.grid, kind=options.visibility)
+    visibility = partial(find_visibility, named, grid=flat.grid, kind=options.visibility)
+    reading, notes = choose(name, array, dialect=dialect, options=options, visibility=partial(_fitting, visibility))
+    visible, how = visibility(reading)
     if depths is None:
         picture = None if flat.grid is None else (flat.grid[1], flat.grid[0])
         placed = place(reading.points, visible, options, picture=picture)
@@ -134,6 +137,16 @@ def upwards(sample: NDArray[np.float64], options: Options) -> tuple[str, list[st
             f"y is assumed to point up: {shares[1]:.0%} of its values are negative, so these are not pixels of a picture."
         ]
     return "down", ["y is assumed to point down, as in pictures: coordinates are not centred on zero."]
+
+
+def _fitting(
+    visibility: Callable[[Reading], tuple[NDArray[np.float64] | None, list[str]]], reading: Reading
+) -> NDArray[np.float64] | None:
+    """Return the visibility of an interpretation; None if the file's does not fit it."""
+    try:
+        return visibility(reading)[0]
+    except InvalidInput:
+        return None
 
 
 def _two_numbers(
