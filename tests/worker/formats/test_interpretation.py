@@ -76,6 +76,18 @@ def test_positions_of_hidden_points_do_not_decide_on_units_and_axes(
     np.testing.assert_array_equal(got.tracks.points[~hidden], POINTS[~hidden])
 
 
+@pytest.mark.parametrize("axes", [(0, 2, 1), (2, 0, 1)], ids=["interleaved", "stacked"])
+def test_positions_of_hidden_points_do_not_decide_on_the_layout_of_the_truth(axes: tuple[int, int, int]) -> None:
+    sequence = face(20, 60)
+    hidden = np.random.default_rng(0).random((20, 60)) < 0.3
+    tracks = np.where(hidden[..., None], -1.0, sequence.tracks.points)
+    understood = understand({"tracks": tracks, "visibility": ~hidden}, Options())
+    shapes, notes = as_shapes(sequence.shapes.transpose(axes).reshape(60, 60), understood)
+    np.testing.assert_array_equal(shapes, sequence.shapes)
+    assert len(notes) == 1
+    assert "leaves 0.0% of the tracks unexplained" in notes[0]
+
+
 @pytest.mark.parametrize("rows", ["interleaved", "stacked"])
 def test_positions_of_hidden_points_do_not_decide_on_the_layout(rows: str) -> None:
     points = face(40, 150).tracks.points
