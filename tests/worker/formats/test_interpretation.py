@@ -170,6 +170,17 @@ def test_a_long_list_of_pixels_is_not_read_as_many_frames() -> None:
     assert understand({"tracks": quick}, Options()).points.shape == (4, 80 * 160, 2)
 
 
+def test_options_of_arrays_that_the_file_does_not_have_are_listed() -> None:
+    set_options = Options(rows="stacked", visibility="logits")
+    unused = understand({"tracks": POINTS}, set_options).notes
+    assert "Not used: the option visibility, because the file has no visibility." in unused
+    assert "Not used: the option rows, because the tracks are no matrix." in unused
+    used = understand(
+        {"W": np.vstack([POINTS[..., 0], POINTS[..., 1]]), "visible_logits": np.ones((F, P))}, set_options
+    ).notes
+    assert not any("Not used" in note for note in used)
+
+
 def test_the_option_y_axis_is_used(tmp_path: Path) -> None:
     assert read(tmp_path, {"tracks": POINTS}).interpretation.y_axis == "down"
     up = read(tmp_path, {"tracks": POINTS}, y_axis="up").interpretation

@@ -81,6 +81,10 @@ def understand(arrays: Arrays, options: Options, *, file: Path | None = None) ->
     visibility = partial(find_visibility, named, grid=flat.grid, kind=options.visibility)
     reading, notes = choose(name, array, dialect=dialect, options=options, visibility=partial(_fitting, visibility))
     visible, how = visibility(reading)
+    if options.visibility != "auto" and visible is None:
+        how.append("Not used: the option visibility, because the file has no visibility.")
+    if options.rows != "auto" and reading.rows is None:
+        how.append("Not used: the option rows, because the tracks are no matrix.")
     if depths is None:
         picture = None if flat.grid is None else (flat.grid[1], flat.grid[0])
         placed = place(reading.points, visible, options, picture=picture)
