@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from pliant.cli.films import as_one_file, inspect_film, is_film, refuse_parts_of_tracks, solve_film
+from pliant.cli.films import inspect_film, is_film, refuse_parts_of_tracks, solve_film
 from pliant.cli.paths import check_inputs, results_folder
 from pliant.cli.session import (
     LINE_EVERY,
@@ -156,9 +156,9 @@ def inspect(
             tracks=file, mesh=faces, ground_truth=ground_truth, rotations=rotations, options=checked
         ).interpretation
     else:
-        with ctx.obj.client(url, as_json=as_json) as client, as_one_file(file) as sent:
+        with ctx.obj.client(url, as_json=as_json) as client:
             interpretation = client.inspect(
-                **{"film" if is_film(file, region) else "tracks": sent}, region=region, mesh=mesh,
+                **{"film" if is_film(file, region) else "tracks": file}, region=region, mesh=mesh,
                 ground_truth=ground_truth, rotations=rotations, options=options,
             )  # fmt: skip
     if as_json:

@@ -163,7 +163,8 @@ def planned(
     used = learned_frames(frames) if ordered else frames
     whole = used if gaussian else frames
     filled += GRAM_SECONDS * whole**2 * points
-    first.append(Stage("completion", 0.1 + filled, 6, growth=RANK_GROWTH))
+    # Without hidden entries, the first rank that explains the tracks is the last.
+    first.append(Stage("completion", 0.1 + filled, 6 if unseen > 0 else 1, growth=RANK_GROWTH))
     if not gaussian and not known_cameras:
         first.append(Stage("factorization", FACTORIZATION_SECONDS * frames**2, 1))
     learned = learning(frames, used, gaussian=gaussian, known_cameras=known_cameras, known_scales=known_scales)

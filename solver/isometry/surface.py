@@ -308,13 +308,15 @@ def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried) -> Isometric
     if template is None:
         return None
     points, enough = complete_anchors(found.depths[..., None] * whole.rays, search.seen, template)
+    if not enough.any():
+        return None
     enter(search.should_stop, "sheet_points")
     all_of_it: Extended = extend(
         tracks.points, relative(tracks.visible, float(tracks.visible.max())), images=search.anchors.points, known=search.seen,
         anchors=points, template=template, focal=chosen.focal, centre=search.centre,
         noise_std=search.anchors.noise_std if search.anchors.denoised else 0.0,
     )  # fmt: skip
-    if not np.isfinite(all_of_it.points).all() or not enough.any():
+    if not np.isfinite(all_of_it.points).all():
         return None
     return IsometricSurface(
         all_of_it.points, all_of_it.outliers, all_of_it.placed, enough, chosen.focal,

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from pliant.cli import app
 from pliant.cli.exits import Exit, code_of
 from pliant.cli.session import Session
@@ -58,6 +59,14 @@ def test_inspect_can_use_a_service(run: Run, service: InMemoryService, tracks: P
     assert "5 frames × 12 points" in run("inspect", tracks, "--url", "http://pliant.test").stdout
     np.savez(tracks, tracks=np.ones((2, 9, 2)))
     assert run("inspect", tracks, "--url", "http://pliant.test").exit_code == Exit.REFUSED
+
+
+def test_inspect_through_a_service_refuses_a_mask_among_the_pictures(run: Run, tmp_path: Path) -> None:
+    for name in ("1.png", "mask.png"):
+        Image.new("L", (8, 6), 255).save(tmp_path / name)
+    ran = run("inspect", tmp_path, "--region", tmp_path / "mask.png", "--url", "http://pliant.test")
+    assert ran.exit_code == Exit.REFUSED
+    assert "region: expected a mask outside the film's folder of pictures" in ran.stderr
 
 
 def test_submit_wait_and_fetch_in_one_command(run: Run, tracks: Path, tmp_path: Path) -> None:

@@ -487,6 +487,16 @@ def test_the_plan_counts_the_gram_matrix_of_many_points() -> None:
     assert 5 < many.seconds < 20  # 100 × 1,000,000 took 15 s with the normalization
 
 
+def test_the_completion_of_clean_tracks_is_planned_with_as_many_units_as_it_takes() -> None:
+    asked: list[int] = []
+    complete(normalize(gallery.talk(40, 200).tracks), should_stop=lambda: bool(asked.append(1)))
+    clean, hidden = (
+        planned(20, 100, gaussian=False, known_cameras=False, sheet=False, unseen=unseen)[0] for unseen in (0.0, 1.0)
+    )
+    assert clean.name == hidden.name == "completion"
+    assert clean.units == len(asked) < hidden.units
+
+
 def test_the_gram_matrix_of_many_points_polls_for_a_stop() -> None:
     points = np.random.default_rng(0).standard_normal((3, 2 * CHUNKS_PER_TICK * POINTS_PER_CHUNK, 2))
     asked = []

@@ -19,9 +19,10 @@ Column = NDArray[np.floating] | NDArray[np.integer] | Iterable[float] | Iterable
 
 def write_frames_csv(result: Result, file: IO[bytes]) -> None:
     """Write one row per frame; truth columns only with ground truth, empty cells where nothing was visible."""
-    residuals, seen = result.solution.residuals, result.inputs.tracks.visible
+    residuals, seen, chosen = result.solution.residuals, result.inputs.tracks.visible, result.inputs.selection
     columns: dict[str, Column] = {
         "frame": np.arange(len(residuals)),
+        **({} if chosen is None else {"source_frame": chosen.frames}),
         "seconds": result.times,
         "visible": (seen > 0).sum(axis=1),
         **_residuals(residuals, seen),
@@ -42,9 +43,10 @@ def write_frames_csv(result: Result, file: IO[bytes]) -> None:
 def write_points_csv(result: Result, file: IO[bytes]) -> None:
     """Write one row per point, with its name if points have names; otherwise as `write_frames_csv`."""
     residuals, seen = result.solution.residuals.T, result.inputs.tracks.visible.T
-    names = result.inputs.point_names
+    names, chosen = result.inputs.point_names, result.inputs.selection
     columns: dict[str, Column] = {
         "point": np.arange(len(residuals)),
+        **({} if chosen is None else {"source_point": chosen.points}),
         **({} if names is None else {"name": names}),
         "visible": (seen > 0).sum(axis=1),
         **_residuals(residuals, seen),

@@ -126,8 +126,8 @@ def as_shapes(array: NDArray[np.generic], understood: Understood) -> tuple[NDArr
     if not found or array.dtype.kind not in "fiu":
         return array, []
     if len(found) == 1:
-        return found[0][1], _far(unexplained(found[0][1], understood.points))
-    costs = [unexplained(shapes, understood.points) for _, shapes in found]
+        return found[0][1], _far(unexplained(found[0][1], understood.points, understood.visible))
+    costs = [unexplained(shapes, understood.points, understood.visible) for _, shapes in found]
     best = int(np.argmin(costs))
     if costs[0] <= MIN_FIT_RATIO * costs[best]:
         best = 0
@@ -136,13 +136,17 @@ def as_shapes(array: NDArray[np.generic], understood: Understood) -> tuple[NDArr
     return found[best][1], [evidence, *_far(costs[best])]
 
 
-def unexplained(shapes: NDArray[np.generic], points: NDArray[np.generic]) -> float:
-    """Return the share of the tracks' extent that no affine camera per frame explains from the shapes; median over some frames."""
+def unexplained(
+    shapes: NDArray[np.generic], points: NDArray[np.generic], visible: NDArray[np.float64] | None = None
+) -> float:
+    """Return the share of the visible tracks' extent that no affine camera per frame explains from the shapes; median over some frames."""
     chosen = np.unique(np.linspace(0, len(points) - 1, COMPARED_FRAMES).round().astype(int))
     shares = []
     for frame in chosen:
         true, seen = np.asarray(shapes[frame], np.float64), np.asarray(points[frame], np.float64)
         usable = (np.abs(true) <= MAX_COORDINATE).all(axis=1) & (np.abs(seen) <= MAX_COORDINATE).all(axis=1)
+        if visible is not None:
+            usable &= visible[frame] > 0
         if usable.sum() < 6:
             continue
         true, seen = true[usable] - true[usable].mean(axis=0), seen[usable] - seen[usable].mean(axis=0)

@@ -57,6 +57,13 @@ def test_nothing_is_filled_in_if_no_frame_shows_enough() -> None:
     assert (filled == points).all()
 
 
+@pytest.mark.slow
+def test_a_body_none_of_whose_frames_show_enough_of_a_sheet_is_rejected() -> None:
+    verdict = surface.isometric_surface(gallery.sphere(10, 60).tracks, focal=600.0, required=True)
+    assert verdict.surface is None
+    assert verdict.reason.startswith("No isometric surface was found")
+
+
 @pytest.mark.parametrize("required", [False, True])
 def test_points_rarely_seen_together_are_not_taken_as_a_sheet(required: bool) -> None:
     flag, random = gallery.flag(30, 600), np.random.default_rng(0)

@@ -188,6 +188,16 @@ def test_csv_tables_agree_with_the_metrics(tmp_path: Path) -> None:
     np.testing.assert_allclose(points["reprojection_rms"], np.sqrt(np.square(solution.residuals).mean(axis=0)))
 
 
+def test_csv_tables_of_a_selection_name_the_frames_and_points_of_the_input(tmp_path: Path) -> None:
+    inputs, solution, options = make_result(outputs="csv")
+    whole = write(tmp_path, (inputs, solution, options))
+    assert not [name for name in rows_of(whole["metrics_frames.csv"]) if name.startswith("source")]
+    chosen = Selection(np.arange(0, 14, 2), np.arange(5, 35), (14, 40))
+    files = write(tmp_path, (dataclasses.replace(inputs, selection=chosen), solution, options))
+    np.testing.assert_array_equal(rows_of(files["metrics_frames.csv"])["source_frame"], chosen.frames)
+    np.testing.assert_array_equal(rows_of(files["metrics_points.csv"])["source_point"], chosen.points)
+
+
 def test_csv_tables_exclude_hidden_observations(tmp_path: Path) -> None:
     made = make_result(hidden=True, outputs="csv")
     inputs, solution, _ = made

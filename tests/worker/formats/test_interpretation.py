@@ -12,6 +12,7 @@ import pytest
 import scipy.io
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Tracks
+from pliant.solver.gallery import face
 from pliant.worker.formats import AmbiguousInput, Inputs, Limits, read_inputs
 from pliant.worker.formats.ground_truth import as_rotations, as_shapes, unexplained
 from pliant.worker.formats.reading.pose_hdf5 import read_hdf5 as read_matlab73
@@ -58,6 +59,46 @@ def test_signed_fractions_are_detected_with_a_known_size(tmp_path: Path) -> None
     alone = read(tmp_path, {"tracks": SIGNED})
     assert alone.interpretation.coordinates == "pixels"
     assert alone.interpretation.y_axis == "up"
+
+
+@pytest.mark.parametrize(
+    ("tracks", "coordinates", "options"),
+    [(POINTS, "pixels", {}), (POINTS, "pixels", {"image_size": "9x5"}), (UNIT, "unit", {"image_size": "9x5"})],
+)
+def test_positions_of_hidden_points_do_not_decide_on_units_and_axes(
+    tracks: np.ndarray, coordinates: str, options: dict[str, str], tmp_path: Path
+) -> None:
+    hidden = np.zeros((F, P), bool)
+    hidden[::2, ::2] = True
+    filled = np.where(hidden[..., None], -1.0, tracks)  # as trackers mark hidden points
+    got = read(tmp_path, {"tracks": filled, "visibility": ~hidden}, **options)
+    assert (got.interpretation.coordinates, got.interpretation.y_axis) == (coordinates, "down")
+    np.testing.assert_array_equal(got.tracks.points[~hidden], POINTS[~hidden])
+
+
+@pytest.mark.parametrize("axes", [(0, 2, 1), (2, 0, 1)], ids=["interleaved", "stacked"])
+def test_positions_of_hidden_points_do_not_decide_on_the_layout_of_the_truth(axes: tuple[int, int, int]) -> None:
+    sequence = face(20, 60)
+    hidden = np.random.default_rng(0).random((20, 60)) < 0.3
+    tracks = np.where(hidden[..., None], -1.0, sequence.tracks.points)
+    understood = understand({"tracks": tracks, "visibility": ~hidden}, Options())
+    shapes, notes = as_shapes(sequence.shapes.transpose(axes).reshape(60, 60), understood)
+    np.testing.assert_array_equal(shapes, sequence.shapes)
+    assert len(notes) == 1
+    assert "leaves 0.0% of the tracks unexplained" in notes[0]
+
+
+@pytest.mark.parametrize("rows", ["interleaved", "stacked"])
+def test_positions_of_hidden_points_do_not_decide_on_the_layout(rows: str) -> None:
+    points = face(40, 150).tracks.points
+    hidden = np.random.default_rng(0).random((40, 150)) < 0.3
+    filled = np.where(hidden[..., None], 0.0, points)
+    matrix = filled.transpose(0, 2, 1) if rows == "interleaved" else filled.transpose(2, 0, 1)
+    assert len(offered(refused("ambiguous_layout", {"W": matrix.reshape(80, 150)}))) == 4
+    got = understand({"W": matrix.reshape(80, 150), "MD": hidden}, Options())
+    np.testing.assert_array_equal(got.points, filled)
+    refused("ambiguous_layout", {"W": matrix.reshape(80, 150), "MD": hidden[1:]})
+    understand({"W": points.transpose(0, 2, 1).reshape(80, 150), "MD": np.ones((40, 150), bool)}, Options())
 
 
 def test_fractions_are_detected_despite_points_outside_the_picture(tmp_path: Path) -> None:
@@ -127,6 +168,17 @@ def test_a_long_list_of_pixels_is_not_read_as_many_frames() -> None:
     first = np.stack([x, y], axis=-1).reshape(1, -1, 2)
     quick = first + 30.0 * np.arange(4)[:, None, None] ** 1.5  # neighbours in the list are closer than frames
     assert understand({"tracks": quick}, Options()).points.shape == (4, 80 * 160, 2)
+
+
+def test_options_of_arrays_that_the_file_does_not_have_are_listed() -> None:
+    set_options = Options(rows="stacked", visibility="logits")
+    unused = understand({"tracks": POINTS}, set_options).notes
+    assert "Not used: the option visibility, because the file has no visibility." in unused
+    assert "Not used: the option rows, because the tracks are no matrix." in unused
+    used = understand(
+        {"W": np.vstack([POINTS[..., 0], POINTS[..., 1]]), "visible_logits": np.ones((F, P))}, set_options
+    ).notes
+    assert not any("Not used" in note for note in used)
 
 
 def test_the_option_y_axis_is_used(tmp_path: Path) -> None:

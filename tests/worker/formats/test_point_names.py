@@ -78,6 +78,28 @@ def test_numbered_columns_have_no_names(here: None, tmp_path: Path) -> None:
     assert not any("names" in note for note in got.interpretation.notes[1:])
 
 
+@pytest.mark.parametrize(
+    ("numbers", "names"),
+    [
+        ((0, 1, 2, 3, 4, 5), None),
+        ((1, 2, 3, 4, 5, 6), tuple("123456")),
+        ((0, 1, 40, 3, 4, 7), ("0", "1", "3", "4", "7", "40")),
+    ],
+)
+def test_points_of_observations_keep_numbers_that_are_not_their_index(
+    numbers: tuple[int, ...], names: tuple[str, ...] | None, here: None, tmp_path: Path
+) -> None:
+    path = tmp_path / "t.csv"
+    rows = [
+        f"{frame},{numbers[point]},{x},{y}"
+        for (frame, point), (x, y) in zip(np.ndindex(F, P), POINTS.reshape(-1, 2), strict=True)
+    ]
+    path.write_text("\n".join(["frame,point,x,y", *rows]))
+    got = read(path)
+    assert got.point_names == names
+    np.testing.assert_array_equal(got.tracks.points, POINTS[:, np.argsort(numbers)])
+
+
 def test_deeplabcut_csv_names_are_read(here: None, tmp_path: Path) -> None:
     assert read(deeplabcut(tmp_path / "t.csv")).point_names == PARTS
     both = tuple(f"{animal}/{part}" for animal in ("mouse1", "mouse2") for part in PARTS[:3])

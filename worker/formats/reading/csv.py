@@ -10,6 +10,7 @@ from typing import IO
 import numpy as np
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import damaged, too_large
+from pliant.worker.formats.point_names import ARRAY, pack
 from pliant.worker.formats.reading.pose_tables import (
     CONFIDENCE,
     LONGEST_ROW,
@@ -49,8 +50,8 @@ def read_csv(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     """Read one observation per line, in any order, or one row per frame, see `pose_tables`.
 
     The smallest frame number is the first frame; gaps are frames without observations. Points are the numbers that occur, in ascending
-    order. Missing observations are hidden. Returns `tracks (F, P, 2)` with NaN where there is no observation, and `visibility (F, P)` if
-    the file has it; tables of known writers under their own names.
+    order, which are their names unless they count from 0 without gaps. Missing observations are hidden. Returns `tracks (F, P, 2)` with NaN
+    where there is no observation, and `visibility (F, P)` if the file has it; tables of known writers under their own names.
 
     Raises
     ------
@@ -117,6 +118,8 @@ def _observations(columns: list[str], rows: list[list[float]], *, field: str, li
     tracks = np.full((count * len(names), 2), np.nan)
     tracks[places] = table[:, [index["x"], index["y"]]]
     found: Arrays = {"tracks": tracks.reshape(count, len(names), 2)}
+    if names[-1] != len(names) - 1 or names[0] != 0:
+        found[ARRAY] = pack([str(name) for name in names.tolist()])
     given = [name for name in CONFIDENCE if name in index]
     # Of two, the second multiplies the first.
     for array, name in zip(("visibility", "confidence"), given, strict=False):

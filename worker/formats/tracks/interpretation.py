@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,7 @@ from pliant.worker.formats.reading.containers import shapes_in
 from pliant.worker.formats.records import Arrays
 from pliant.worker.formats.tracks.dense import flatten
 from pliant.worker.formats.tracks.layouts import Reading, choose
-from pliant.worker.formats.tracks.pixels import Placed, place, project
+from pliant.worker.formats.tracks.pixels import Placed, place, project, sampled
 from pliant.worker.formats.tracks.tracker_formats import (
     INTRINSICS,
     OWN,
@@ -76,14 +78,20 @@ def understand(arrays: Arrays, options: Options, *, file: Path | None = None) ->
         return _of_our_tracker(named, name, options)
     flat = flatten(name, _numeric(named[name], name))
     array, depths, named = _two_numbers(flat.array, name, dialect, named)
-    reading, notes = choose(name, array, dialect=dialect, options=options)
-    visible, how = find_visibility(named, reading, grid=flat.grid, kind=options.visibility)
+    visibility = partial(find_visibility, named, grid=flat.grid, kind=options.visibility)
+    reading, notes = choose(name, array, dialect=dialect, options=options, visibility=partial(_fitting, visibility))
+    visible, how = visibility(reading)
+    if options.visibility != "auto" and visible is None:
+        how.append("Not used: the option visibility, because the file has no visibility.")
+    if options.rows != "auto" and reading.rows is None:
+        how.append("Not used: the option rows, because the tracks are no matrix.")
     if depths is None:
         picture = None if flat.grid is None else (flat.grid[1], flat.grid[0])
-        placed = place(reading.points, options, picture=picture)
+        placed = place(reading.points, visible, options, picture=picture)
     else:
         placed = _projected(depths, reading, named)
-    y_axis, why = ("down", []) if depths is not None and options.y_axis == "auto" else upwards(placed.points, options)
+    known = depths is not None and options.y_axis == "auto"
+    y_axis, why = ("down", []) if known else upwards(sampled(placed.points, visible), options)
     layout = reading.layout if flat.grid is None else f"{reading.layout}, P = {flat.grid[0]} × {flat.grid[1]} pixels"
     whose = [] if dialect.name in PLAIN else [f"Recognised as the output of {dialect.name} by the names in the file."]
     if dialect.note and options.coordinate_order == "auto":
@@ -123,18 +131,26 @@ def _names(named: Arrays, count: int, *, ordered: bool) -> tuple[str, ...] | Non
     return unpack(given, count) if ordered else None
 
 
-def upwards(points: NDArray[np.generic], options: Options) -> tuple[str, list[str]]:
-    """Return the direction of y: from the options, else down unless the coordinates are centred on zero, unlike pixels."""
+def upwards(sample: NDArray[np.float64], options: Options) -> tuple[str, list[str]]:
+    """Return the direction of y: from the options, else down unless the coordinates `(N, 2)` are centred on zero, unlike pixels."""
     if options.y_axis != "auto":
         return options.y_axis, [f"y points {options.y_axis}, as set by y_axis."]
-    flat = points.reshape(-1, 2)[:: max(1, points.shape[0] * points.shape[1] // 100_000)]
-    finite = flat[np.isfinite(flat).all(axis=1)]
-    shares = (finite < 0).mean(axis=0) if len(finite) else np.zeros(2)
+    shares = (sample < 0).mean(axis=0) if len(sample) else np.zeros(2)
     if (shares >= CENTRED).all():
         return "up", [
             f"y is assumed to point up: {shares[1]:.0%} of its values are negative, so these are not pixels of a picture."
         ]
     return "down", ["y is assumed to point down, as in pictures: coordinates are not centred on zero."]
+
+
+def _fitting(
+    visibility: Callable[[Reading], tuple[NDArray[np.float64] | None, list[str]]], reading: Reading
+) -> NDArray[np.float64] | None:
+    """Return the visibility of an interpretation; None if the file's does not fit it."""
+    try:
+        return visibility(reading)[0]
+    except InvalidInput:
+        return None
 
 
 def _two_numbers(

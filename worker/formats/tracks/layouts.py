@@ -7,6 +7,7 @@ x and y are neighbouring frames of one coordinate and almost equal, which is det
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +30,9 @@ ALIKE = 0.98
 """Correlation of x and y over the points, in the median frame, above which both are the same coordinate."""
 
 COMPARED_POINTS = 96
+
+LEAST_FINITE = 0.01
+"""Share of positions below which they show no smoothness; if fewer are visible, the hidden ones count, too."""
 
 MANY_FRAMES = 10_000
 """Maximum length of the frame axis. A longer axis lists pixels, whose neighbours are closer than consecutive frames."""
@@ -91,13 +95,17 @@ def usable(found: list[Reading]) -> list[Reading]:
     return [one for one in fit if one.points.shape[0] <= MANY_FRAMES] or fit or found[:1]
 
 
-def roughness(points: NDArray[np.generic]) -> float:
-    """Return the mean step in time over the spread of the coordinates, for a sample; infinite if x and y are the same."""
+def roughness(points: NDArray[np.generic], visible: NDArray[np.float64] | None = None) -> float:
+    """Return the mean step in time over the spread of the visible coordinates, for a sample; infinite if x and y are the same."""
     count = points.shape[1]
     chosen = np.unique(np.linspace(0, count - 1, COMPARED_POINTS).round().astype(int))
     sample = np.asarray(points[: 4 * COMPARED_POINTS][:, chosen], dtype=np.float64)
     sample = np.where(np.isfinite(sample) & (np.abs(sample) <= MAX_COORDINATE), sample, np.nan)
-    if np.isfinite(sample).all(axis=2).mean() < 0.01:
+    if visible is not None:
+        hidden = visible[: len(sample), chosen] == 0
+        if hidden.mean() < 1 - LEAST_FINITE:
+            sample[hidden] = np.nan
+    if np.isfinite(sample).all(axis=2).mean() < LEAST_FINITE:
         return float("inf")
     with np.errstate(invalid="ignore", divide="ignore"):
         spread = np.nanstd(sample, axis=(0, 1)).mean()
@@ -125,10 +133,14 @@ def _step(sample: NDArray[np.float64]) -> float:
     return float(np.nanmean(np.abs(steps))) if np.isfinite(steps).any() else float("inf")
 
 
-def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: Options) -> tuple[Reading, list[str]]:
+def choose(
+    name: str, array: NDArray[np.generic], *, dialect: Dialect, options: Options,
+    visibility: Callable[[Reading], NDArray[np.float64] | None],
+) -> tuple[Reading, list[str]]:  # fmt: skip
     """Select the interpretation that the options request, that is documented, or that the data indicate; return it and notes.
 
-    The array has no batch axis. The documented layout of the dialect is used unless another is five times smoother in time.
+    The array has no batch axis. The documented layout of the dialect is used unless another is five times smoother in time. `visibility`
+    returns the visibility `(F, P)` of an interpretation, None without one.
 
     Raises
     ------
@@ -151,7 +163,7 @@ def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: 
     _check_size(name, array, allowed[0])
     if len(allowed) == 1:
         return allowed[0], []
-    costs = {one.layout: roughness(one.points) for one in allowed}
+    costs = {one.layout: roughness(one.points, visibility(one)) for one in allowed}
     ranked = sorted(allowed, key=lambda one: costs[one.layout])
     documented = [one for one in ranked if order in (None, one.order) or options.layout != "auto"] or ranked
     best, others = documented[0], documented[1:]

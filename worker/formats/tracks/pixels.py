@@ -13,6 +13,7 @@ from pliant.solver.limits import MAX_COORDINATE
 from pliant.worker.formats.errors import AmbiguousInput
 
 MAX_COMPARED = 100_000
+"""Number of positions, roughly, that the interpretation of coordinates looks at."""
 SLACK = 0.02
 FRACTIONS = ("unit", "signed")
 """Kinds of coordinates that are fractions of the picture."""
@@ -33,8 +34,11 @@ class Placed:
     notes: list[str]
 
 
-def place(points: NDArray[np.generic], options: Options, *, picture: tuple[int, int] | None = None) -> Placed:
-    """Convert fractions of the picture to pixels, and the coordinate order to x, y.
+def place(
+    points: NDArray[np.generic], visible: NDArray[np.float64] | None, options: Options, *,
+    picture: tuple[int, int] | None = None,
+) -> Placed:  # fmt: skip
+    """Convert fractions of the picture to pixels, and the coordinate order to x, y, by the visible points.
 
     `picture` is its width and height, if the points are all its pixels.
 
@@ -46,7 +50,7 @@ def place(points: NDArray[np.generic], options: Options, *, picture: tuple[int, 
         Code ambiguous_coordinates: values from 0 to 1, which may be fractions of a picture or another unit.
     """
     size = options.picture_size
-    sample = _sampled(points)
+    sample = sampled(points, visible)
     points, sample, notes = _ordered(points, sample, options, size)
     kind, why = _kind(sample, options, size or picture)
     if kind == "pixels":
@@ -103,9 +107,12 @@ def project(
     return seen, "projected", [note]
 
 
-def _sampled(points: NDArray[np.generic]) -> NDArray[np.float64]:
-    flat = points.reshape(-1, 2)[:: max(1, points.shape[0] * points.shape[1] // MAX_COMPARED)].astype(np.float64)
-    return flat[(np.abs(flat) <= MAX_COORDINATE).all(axis=1)]
+def sampled(points: NDArray[np.generic], visible: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """Return some of the visible positions, `(N, 2)`: trackers write any numbers, such as −1, where a point is hidden."""
+    every = slice(None, None, max(1, points.shape[0] * points.shape[1] // MAX_COMPARED))
+    flat = points.reshape(-1, 2)[every].astype(np.float64)
+    used = (np.abs(flat) <= MAX_COORDINATE).all(axis=1)
+    return flat[used if visible is None else used & (visible.reshape(-1)[every] > 0)]
 
 
 def _ordered(
