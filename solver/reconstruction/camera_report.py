@@ -64,6 +64,10 @@ def described(view: Perspective, unit: float) -> str:
         best = min((each for each in nll if each != 0), key=lambda each: nll[each], default=None)
         if best is None:
             return "Orthography: perspective was not compared."
+        if nll[best] >= UNLIKELY:
+            return (
+                f"Orthography: perspective with focal length {unit / abs(best):.4g} is impossible, because {DIVERGED}."
+            )
         return (
             f"Orthography: the best perspective compared, focal length {unit / abs(best):.4g}, changes the log likelihood per point "
             f"and frame by {nll[0.0] - nll[best]:+.3f}; more than {MIN_PERSPECTIVE_GAIN} is required, and a clear sign of depth."

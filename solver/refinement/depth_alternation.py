@@ -15,6 +15,7 @@ from pliant.solver.cameras.aimed import Aimed, towards
 from pliant.solver.cameras.factorization import upgrades
 from pliant.solver.cameras.multistart import CANDIDATES
 from pliant.solver.cameras.perspective import Perspective, corrected, depths_of
+from pliant.solver.model.marginal_likelihood import UNLIKELY
 from pliant.solver.model.so3 import MIRROR, nearest
 from pliant.solver.pulse import never
 from pliant.solver.records import Floats
@@ -59,13 +60,15 @@ def alternate(
         if how.should_stop():
             break
         try:
-            found = _relearned(views, view.inverse_focal, found, how)
+            moved = _relearned(views, view.inverse_focal, found, how)
         except np.linalg.LinAlgError:
             break
-        found, inverse_focal = refine_with_focal(
-            views, found, view.inverse_focal, free=view.given is None, turning=how.turning
+        moved, inverse_focal = refine_with_focal(
+            views, moved, view.inverse_focal, free=view.given is None, turning=how.turning
         )
-        view = replace(view, inverse_focal=inverse_focal)
+        if moved.energy >= UNLIKELY:
+            break
+        found, view = moved, replace(view, inverse_focal=inverse_focal)
     return found, view
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import Perspective, corrected_moments, depth_map, mirrored
 from pliant.solver.cameras.planar_ambiguity import is_planar
+from pliant.solver.model.marginal_likelihood import UNLIKELY
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR
 from pliant.solver.records import Floats, read_only
@@ -28,7 +29,7 @@ from different starts differ by as much."""
 
 
 def correct_perspective(evidence: Evidence, how: Refinement) -> Evidence:
-    """Return the evidence with κ determined and the tracks corrected; if κ is 0, only `perspective` is updated.
+    """Return the evidence with κ determined and the tracks corrected; if κ is 0 or depths diverge, only `perspective` is updated.
 
     Parameters
     ----------
@@ -49,15 +50,17 @@ def correct_perspective(evidence: Evidence, how: Refinement) -> Evidence:
     if not view.is_perspective:
         return replace(evidence, estimate=replace(estimate, perspective=view))
     reached, best = _correct_from(evidence, found, view, how)
-    if not how.turning or is_planar(reached.estimate.gram):
-        return reached
-    reached, best = _restart(reached, best, how)
-    start = affine_iterations(*cameras, view, how)
-    if start is None:
-        return reached
-    found, inverse_focal = start
-    other, found = _restart(*_correct_from(evidence, found, replace(view, inverse_focal=inverse_focal), how), how)
-    return other if found.energy < best.energy - MIN_GAIN else reached
+    if how.turning and not is_planar(reached.estimate.gram):
+        reached, best = _restart(reached, best, how)
+        start = affine_iterations(*cameras, view, how)
+        if start is not None:
+            found, inverse_focal = start
+            other = replace(view, inverse_focal=inverse_focal)
+            again, found = _restart(*_correct_from(evidence, found, other, how), how)
+            reached, best = (again, found) if found.energy < best.energy - MIN_GAIN else (reached, best)
+    if best.energy >= UNLIKELY:  # the depths diverge, so no tracks can be corrected with them
+        return replace(evidence, estimate=replace(estimate, perspective=replace(view, inverse_focal=0.0)))
+    return reached
 
 
 def _correct_from(evidence: Evidence, found: Learned, view: Perspective, how: Refinement) -> tuple[Evidence, Learned]:
@@ -76,10 +79,11 @@ def _correct_from(evidence: Evidence, found: Learned, view: Perspective, how: Re
 def _restart(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evidence, Learned]:
     """Return the evidence after alternations from cameras of the corrected tracks, repeated while the likelihood rises.
 
-    `found` holds the estimate's cameras and covariance at the frames used, and is returned refined.
+    `found` holds the estimate's cameras and covariance at the frames used, and is returned refined. If its depths diverge, no
+    restart is tried.
     """
     used, scales = evidence.used, evidence.start_scales
-    for _ in range(RESTARTS):
+    for _ in range(RESTARTS if found.energy < UNLIKELY else 0):
         view = evidence.estimate.perspective
         assert view is not None
         rotations = refactorize(scales, view, found, used, how)

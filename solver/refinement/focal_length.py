@@ -177,7 +177,7 @@ class _Comparison:
                 self.views, found, inverse_focal, free=False, turning=self.how.turning, iterations=SEARCH_ITERATIONS
             )
         except np.linalg.LinAlgError:  # the depths diverge
-            return _Trial(inverse_focal, UNLIKELY, found)
+            return _Trial(inverse_focal, UNLIKELY, replace(found, energy=UNLIKELY))
         return _Trial(inverse_focal, found.energy, found)
 
 

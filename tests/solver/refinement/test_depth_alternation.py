@@ -73,6 +73,35 @@ def test_a_round_that_leads_to_extreme_depths_is_discarded(
     assert moved is view
 
 
+def rolled_and_turned(frames: int, points: int) -> Tracks:
+    """A sheet that rolls up while it turns from one edge to the other, 1.3 half-sizes before a pinhole with φ = 390 px."""
+    time = np.linspace(0, 1, frames)
+    across, down = (each.ravel()[:points] for each in np.meshgrid(np.linspace(-1, 1, 7), np.linspace(-0.7, 0.7, 7)))
+    bend, angle = 1.2 * np.sin(0.3 + 4.7 * time)[:, None], 0.5 * np.sin(3 * time)[:, None]
+    rolled, kept = across * np.cos(angle) + down * np.sin(angle), down * np.cos(angle) - across * np.sin(angle)
+    arc, depth = np.sin(bend * rolled) / bend, (1 - np.cos(bend * rolled)) / bend
+    shapes = np.stack(
+        [arc * np.cos(angle) - kept * np.sin(angle), arc * np.sin(angle) + kept * np.cos(angle), depth], axis=2
+    )
+    turns = exponential(np.radians(180 * time - 90)[:, None] * np.array([0.0, 1.0, 0.0]))
+    seen = (shapes - shapes.mean(axis=1, keepdims=True)) @ turns.transpose(0, 2, 1)
+    seen *= 300 / np.abs(seen).max()
+    noise = 0.3 * np.random.default_rng(0).normal(size=(frames, points, 2))
+    return Tracks.from_arrays((np.array(PICTURE) - 1) / 2 + seen[..., :2] / (1 + seen[..., 2:] / 390) + noise)
+
+
+def test_where_depths_diverge_at_the_given_focal_length_the_cameras_are_orthographic() -> None:
+    settings = Settings(focal=390.0, image_size=PICTURE, surface="free")
+    solution = solve(rolled_and_turned(20, 48), settings=settings)
+    assert np.isfinite(solution.shapes).all()
+    assert solution.choices.camera == "scaled_orthographic"
+    assert "is impossible, because the depths of the points diverge" in solution.choices.reasons["camera_model"]
+    (warning,) = (each for each in solution.choices.warnings if "focal length" in each)
+    assert warning == "The given focal length, 390, is improbable: the depths of the points diverge with it."
+    assert solution.trust is not None
+    assert solution.trust.verdict != "good"
+
+
 @pytest.mark.slow
 @pytest.mark.long
 def test_a_film_from_nearby_needs_cameras_from_the_corrected_tracks(monkeypatch: pytest.MonkeyPatch) -> None:
