@@ -79,7 +79,7 @@ def described(view: Perspective, unit: float) -> str:
     gains = f"gains {nll[0.0] - own:.3f} in the log likelihood per point and frame over orthography"
     length = f"{unit / abs(view.inverse_focal):.4g} {how}".strip()
     if own >= UNLIKELY:
-        return f"Perspective with focal length {length}: {DIVERGED}."
+        return f"Perspective with focal length {length}, although {DIVERGED} from the first cameras."
     if view.given is not None:
         return f"Perspective with focal length {length}: {gains}."
     return f"Perspective {gains}. The focal length, estimated together with cameras and covariance, is {length}."
