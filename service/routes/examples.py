@@ -28,7 +28,7 @@ class ExampleFile(Record):
 
 
 class Example(Record):
-    """A synthetic sequence with ground truth."""
+    """A synthetic sequence with ground truth, or a rendered film."""
 
     name: str = Field(description="Its name in addresses.")
     title: str = Field(description="What it shows, in a few words.")
@@ -47,7 +47,7 @@ class Examples(Record):
 
 @router.get("", operation_id="list_examples", summary="List example inputs", responses=problems(401))
 def examples(request: Request) -> Examples:
-    """Return synthetic sequences whose files can be sent as the parts of a job."""
+    """Return synthetic sequences and films whose files can be sent as the parts of a job."""
     return Examples(
         examples=[
             Example(

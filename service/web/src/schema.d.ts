@@ -90,7 +90,7 @@ export interface components {
         };
         /**
          * Example
-         * @description A synthetic sequence with ground truth.
+         * @description A synthetic sequence with ground truth, or a rendered film.
          */
         Example: {
             /**
