@@ -226,7 +226,8 @@ class Job(Record):
     started_at: datetime | None = Field(default=None, description="When its attempt began; null while it waits.")
     finished_at: datetime | None = Field(default=None, description="When the status became final; null until then.")
     expires_at: datetime | None = Field(
-        default=None, description="When the job and its files are removed; null: never."
+        default=None,
+        description="When the job and its files are removed; null until the job has ended, and if they are kept.",
     )
     attempt: int = Field(default=0, description="Number of attempts so far.")
     retry_of: str | None = Field(default=None, description="The finished job that this one repeats.")
@@ -239,7 +240,10 @@ class Job(Record):
         description="`high`, `normal` or `low`: order among the waiting jobs of one owner; "
         "it does not put a job ahead of other owners' jobs.",
     )
-    place_in_queue: int | None = Field(default=None, description="Number of queued jobs ahead; null if not queued.")
+    place_in_queue: int | None = Field(
+        default=None,
+        description="Number of queued jobs ahead; null if not queued, while held back by `max_running`, and in events.",
+    )
     options: Options = Field(description="All options, also those that were not given.")
     interpretation: Interpretation = Field(description="How the inputs were read.")
     progress: Progress | None = Field(

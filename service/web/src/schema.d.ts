@@ -458,7 +458,7 @@ export interface components {
             finished_at: string | null;
             /**
              * Expires At
-             * @description When the job and its files are removed; null: never.
+             * @description When the job and its files are removed; null until the job has ended, and if they are kept.
              */
             expires_at: string | null;
             /**
@@ -486,7 +486,7 @@ export interface components {
             priority: "high" | "normal" | "low";
             /**
              * Place In Queue
-             * @description Number of queued jobs ahead; null if not queued.
+             * @description Number of queued jobs ahead; null if not queued, while held back by `max_running`, and in events.
              */
             place_in_queue: number | null;
             /** @description All options, also those that were not given. */
