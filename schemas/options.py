@@ -244,7 +244,8 @@ class Options(Chosen):
     )
     y_axis: Literal["auto", "down", "up"] = Field(
         default="auto",
-        description="Direction of y. auto: down (pixels), or up if coordinates are centred on zero. Written meshes are always upright.",
+        description="Direction of y. auto: down (pixels), or up if coordinates are centred on zero. With the wrong one, the result is "
+        "upside down and mirrored.",
     )
     coordinates: Literal["auto", "pixels", "unit", "signed"] = Field(
         default="auto",

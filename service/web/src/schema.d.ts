@@ -774,7 +774,7 @@ export interface components {
             rows: "auto" | "interleaved" | "stacked";
             /**
              * Y Axis
-             * @description Direction of y. auto: down (pixels), or up if coordinates are centred on zero. Written meshes are always upright.
+             * @description Direction of y. auto: down (pixels), or up if coordinates are centred on zero. With the wrong one, the result is upside down and mirrored.
              * @default auto
              * @enum {string}
              */
