@@ -106,10 +106,10 @@ class Client(Connection):
         mesh : array_like, (rows, columns), path, optional
             Faces (T, 3) or (T, 4), the size of a grid, a mesh file, or ``"none"``. Vertex i is point i. By default the
             service triangulates the tracks.
-        ground_truth : array_like or path, optional
+        ground_truth : array_like, mapping or path, optional
             True shapes (F, P, 3); the job then has error metrics.
-        rotations : array_like or path, optional
-            Known cameras (F, 2, 3) or (F, 3, 3).
+        rotations : array_like, mapping or path, optional
+            Known cameras (F, 2, 3) or (F, 3, 3), or ``{"rotations": …, "scales": …}`` with scales (F,) in pixels per unit of the shapes.
         inputs_of : str, optional
             Id of an earlier job whose inputs are reused with these options, instead of files.
         options : Options or mapping, optional
@@ -230,10 +230,10 @@ class Client(Connection):
             Shape (F, P), bool or confidence in [0, 1]; only with an array of tracks.
         mesh : array_like, (rows, columns), path, optional
             Faces (T, 3) or (T, 4), the size of a grid, a mesh file, or ``"none"``.
-        ground_truth : array_like or path, optional
+        ground_truth : array_like, mapping or path, optional
             True shapes (F, P, 3).
-        rotations : array_like or path, optional
-            Known cameras (F, 2, 3) or (F, 3, 3).
+        rotations : array_like, mapping or path, optional
+            Known cameras, as for `submit`.
         options : Options or mapping, optional
             Options that determine how the inputs are read.
         on_upload : callable, optional

@@ -179,6 +179,13 @@ def test_inspecting_returns_the_interpretation_without_creating_a_job(client: Cl
     assert caught.value.code == "too_few_frames"
 
 
+def test_known_cameras_may_have_scales(client: Client) -> None:
+    cameras = {"rotations": np.tile(np.eye(3), (6, 1, 1)), "scales": np.full(6, 2.0)}
+    assert client.inspect(moving_points(), rotations=cameras).has_rotations
+    with pytest.raises(InvalidRequest, match="beside given scales"):
+        client.inspect(moving_points(), rotations=cameras, options={"camera": "orthographic"})
+
+
 def test_a_key_also_counts_beside_an_id(client: Client) -> None:
     key, points = secrets.token_hex(4), np.random.default_rng(7).normal(size=(5, 30, 2))
     first = client.submit(points, options=FAST, job_id=f"take-{key}", idempotency_key=key)
