@@ -144,7 +144,9 @@ class Estimate(Record):
     """Expected memory and time of a job, from its numbers of frames and points. Correct within a factor of about two."""
 
     memory_bytes: int = Field(description="Largest memory of the process that works on the job.")
-    seconds: float = Field(description="Processor seconds on one core of a usual machine.")
+    seconds: float = Field(
+        description="Processor seconds on one core of a usual machine, without the test for an isometric surface."
+    )
 
 
 class Interpretation(Record):

@@ -38,9 +38,16 @@ With `image_size`, the solver alone, processor s, noise of .5 px (`python -m ben
     60 × 500          20.2                29.1               19.2       19.7
     120 × 1,000       37.9                47.0               33.1       32.5
 
-Tracks that resemble those of a sheet take up to 25 s more, for the test for an isometric surface. Those of a sheet take the times below
-instead, which only the test can tell unless `surface=isometric` is set: the solver alone, processor s, made-up paper. Without the option,
-the estimates of the last three are 49.5, 48.2 and 57.2 s.
+Tracks that resemble those of a sheet take more, for the test for an isometric surface: processor s of the solver alone with `surface=free`,
+and with `auto` (estimate), of films of faces as tracked:
+
+    frames × points   free   auto   estimate
+    12 × 1,819         4.8   19.6        5.7
+    16 × 2,231         5.9   15.5        7.5
+    30 × 2,307        11.3   40.9       13.6
+
+Tracks of a sheet take the times below instead, which only the test can tell unless `surface=isometric` is set: the solver alone,
+processor s, made-up paper. Without the option, the estimates of the last three are 49.5, 48.2 and 57.2 s.
 
     frames × points   processor, s   estimate
     20 × 144                   7.9        11.2

@@ -84,7 +84,7 @@ export interface components {
             memory_bytes: number;
             /**
              * Seconds
-             * @description Processor seconds on one core of a usual machine.
+             * @description Processor seconds on one core of a usual machine, without the test for an isometric surface.
              */
             seconds: number;
         };
