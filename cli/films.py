@@ -18,6 +18,11 @@ if TYPE_CHECKING:
     from pliant.worker.films.tracker import FilmFacts
     from pliant.worker.jobs.finished import Finished
 
+SHEET_TEST = (
+    "The test for a sheet such as paper can take half a minute more; for a face or a body, -O surface=free omits it."
+)
+"""What the time estimate does not count, because only the tracks show whether the test is needed."""
+
 
 def is_film(path: Path, region: Path | None) -> bool:
     """Return True if a command's input is a film, by its content and name or because a region was given."""
@@ -122,6 +127,8 @@ def film_rows(facts: FilmFacts, options: Options, estimate: Estimate | None) -> 
         tracking, solving = facts.track_seconds, estimate.seconds
         parts = f"tracking {tracking:,.0f} s, reconstruction {solving:,.0f} s on one core"
         rows += [("time", f"about {tracking + solving:,.0f} s: {parts}"), ("memory", f"about {in_gigabytes(estimate)}")]
+        if options.surface == "auto":
+            rows.append(("note", SHEET_TEST))
     return rows
 
 

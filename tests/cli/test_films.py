@@ -110,6 +110,8 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
     times = r"time about (\d+) s: tracking (\d+) s, reconstruction (\d+) s on one core memory about \d\.\d GB"
     ((total, tracking, solving),) = re.findall(times, words)
     assert abs(int(total) - int(tracking) - int(solving)) <= 1  # each is rounded
+    assert "-O surface=free omits it" in words
+    assert "surface=free" not in inspect(film, "-O", "surface=free").output
     assert read["warnings"] == []
     assert [each[:19] for each in everything["warnings"]] == ["No region was given"]
     assert "warning No region was given" in words
