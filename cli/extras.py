@@ -13,9 +13,9 @@ class MissingExtra(Exception):
 
     code = "missing_extra"
 
-    def __init__(self, command: str) -> None:
+    def __init__(self, command: str, *, part: str = "the service", extra: str = "server") -> None:
         super().__init__(
-            f"{command} needs the service, which is not installed: pip install '.[server]' in Pliant's source folder"
+            f"{command} needs {part}, which is not installed: pip install '.[{extra}]' in Pliant's source folder"
         )
 
 
@@ -34,6 +34,18 @@ def require_server(command: str) -> None:
     """
     if missing_modules():
         raise MissingExtra(command)
+
+
+def require_opencv(command: str) -> None:
+    """Check that OpenCV is installed, which the extras `film` and `server` install.
+
+    Raises
+    ------
+    MissingExtra
+        It is not installed.
+    """
+    if not _is_installed("cv2"):
+        raise MissingExtra(command, part="OpenCV", extra="film")
 
 
 def _is_installed(name: str) -> bool:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from pliant.cli.extras import require_opencv
 from pliant.cli.paths import input_file, output_file, write_aside
 from pliant.cli.session import LINE_EVERY, Force, Json, one_numerical_thread
 from pliant.cli.show import err, out, print_json, show_warnings
@@ -60,6 +61,7 @@ def track(
         output_file(path, name, force=force, suffixes=suffixes, others=others)
         others.append(path)
     _preview_outside(film, preview)
+    require_opencv("pliant track")
     from pliant.tracking import track_film
 
     shown = 0

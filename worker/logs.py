@@ -7,7 +7,6 @@ from contextvars import ContextVar
 from typing import Literal
 
 from pydantic.dataclasses import dataclass
-from pythonjsonlogger.json import JsonFormatter
 
 LogLevel = Literal["debug", "info", "warning", "error"]
 LogFormat = Literal["console", "json"]
@@ -55,6 +54,10 @@ def formatter(format: LogFormat) -> logging.Formatter:
     """Return the formatter; JSON lines include every extra field of a record, and times as RFC 3339 in UTC."""
     if format == "console":
         return logging.Formatter("%(asctime)s %(levelname)s %(name)s [%(request_id)s]: %(message)s")
+    from pythonjsonlogger.json import (
+        JsonFormatter,  # here, because the settings are read without the extra `server`, too
+    )
+
     return JsonFormatter(
         ["levelname", "name", "message", "request_id"],
         timestamp="time",

