@@ -103,6 +103,8 @@ def as_result(case: Case, options: Options) -> Result:
             laplacian="grid8", unit=1.0, noise=0.0, reasons={}, warnings=(),
         ),
         seconds={},
+        shapes_std=1 + residuals,
+        inlier_probability=np.exp(-residuals),
     )  # fmt: skip
     interpretation = Interpretation(
         num_frames=frames, num_points=count, num_faces=0 if case.mesh is None else len(case.mesh.faces), hidden_fraction=0.0,
