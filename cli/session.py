@@ -40,7 +40,8 @@ Region = Annotated[
 ]
 """The commands check paths themselves, so that every invalid path has the same exit code and form of message."""
 Mesh = Annotated[
-    str | None, typer.Option("--mesh", "-m", help="Mesh file, or the size of a grid such as 12x20.", metavar="FILE|RxC")
+    str | None,
+    typer.Option("--mesh", "-m", help="Mesh file, the size of a grid such as 12x20, or none.", metavar="FILE|RxC"),
 ]
 GroundTruth = Annotated[
     Path | None,

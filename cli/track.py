@@ -37,7 +37,9 @@ def track(
     template_frame: Annotated[
         int | None,
         typer.Option(
-            "--template-frame", help="Frame whose points are followed; by default a sharp one in the middle.", min=0
+            "--template-frame",
+            help="Frame whose points are followed; by default the mask's if it lies in the middle third, else a sharp one there.",
+            min=0,
         ),
     ] = None,
     frames: Annotated[
