@@ -100,15 +100,12 @@ class Reconstruction:
 
     @property
     def inlier_probability(self) -> NDArray[np.float32] | None:
-        """Posterior probability that an observation is an inlier, shape (F, P): 0 where rejected, NaN where hidden.
-
-        None in results of earlier versions.
-        """
+        """Posterior probability that an observation is an inlier, shape (F, P): 0 where rejected, NaN where hidden."""
         return self.arrays.get("inlier_probability")
 
     @property
     def point_names(self) -> tuple[str, ...] | None:
-        """Names of the P points in the track file (DeepLabCut, SLEAP, MediaPipe, named columns); None if it has none."""
+        """Names of the P points in the track file (DeepLabCut, SLEAP, MediaPipe, named columns, `point_names`); None if it has none."""
         names = self.arrays.get("point_names")
         return None if names is None else tuple(names.tolist())
 
