@@ -22,6 +22,9 @@ Source = ArrayLike | Mapping[str, Any] | Path | str
 Region = NDArray[np.bool] | NDArray[np.uint8] | Path | str
 """A mask of a film's size: an array (H, W) of bool, or of uint8 with 128 and above inside, or the path of a picture."""
 
+POINT_NAMES = "point_names"
+"""Key of a dictionary of tracks whose array is text: the names of the points."""
+
 EXPECTED = {
     "film": "the path of a film or of a folder of pictures",
     "region": "the path of a mask picture, or an array (H, W)",
@@ -44,7 +47,8 @@ def tracks_file(tracks: Source, visible: ArrayLike | None, folder: Path) -> Path
         return existing_file(tracks, "tracks")
     if isinstance(tracks, Mapping):
         refuse_visible(visible)
-        return _npz(folder / "tracks.npz", {str(key): _array(value, str(key)) for key, value in tracks.items()})
+        arrays = {str(key): _array(value, str(key), text=key == POINT_NAMES) for key, value in tracks.items()}
+        return _npz(folder / "tracks.npz", arrays)
     arrays = {"tracks": _array(tracks, "tracks")}
     if visible is not None:
         arrays["visibility"] = _array(visible, "visible")
@@ -225,8 +229,11 @@ def existing_file(path: Path | str, name: str) -> Path:
     return found
 
 
-def _array(value: Any, name: str) -> NDArray[np.generic]:
-    """Convert anything that NumPy accepts, and PyTorch and JAX tensors on any device; masked entries become NaN."""
+def _array(value: Any, name: str, *, text: bool = False) -> NDArray[np.generic]:
+    """Convert anything that NumPy accepts, and PyTorch and JAX tensors on any device; masked entries become NaN.
+
+    With `text`, the array may also be one of text.
+    """
     for step in ("detach", "cpu"):
         if hasattr(value, "__array__") and hasattr(value, step):  # a file has `detach`, too, which makes it unusable
             value = getattr(value, step)()
@@ -236,7 +243,7 @@ def _array(value: Any, name: str) -> NDArray[np.generic]:
         array = np.asarray(value)
     except (TypeError, ValueError):  # rows of several lengths, or an object that NumPy cannot convert
         array = np.asarray(None)
-    if array.dtype.kind not in "biuf":
+    if array.dtype.kind not in ("biufU" if text else "biuf"):
         got = f"dtype {array.dtype}" if hasattr(value, "dtype") else f"{kind_of(value)}, which cannot be converted"
         raise BadArgument(
             f"{name}: expected an array of numbers or booleans, got {got}. "

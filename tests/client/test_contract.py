@@ -186,6 +186,11 @@ def test_known_cameras_may_have_scales(client: Client) -> None:
         client.inspect(moving_points(), rotations=cameras, options={"camera": "orthographic"})
 
 
+def test_a_dictionary_may_name_the_points(client: Client) -> None:
+    named = {"tracks": moving_points(), "point_names": [f"marker {number}" for number in range(16)]}
+    assert any("names its 16 points: marker 0" in note for note in client.inspect(named).notes)
+
+
 def test_a_key_also_counts_beside_an_id(client: Client) -> None:
     key, points = secrets.token_hex(4), np.random.default_rng(7).normal(size=(5, 30, 2))
     first = client.submit(points, options=FAST, job_id=f"take-{key}", idempotency_key=key)
