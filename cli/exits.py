@@ -90,21 +90,29 @@ def sentence_of(fault: BaseException, job: str | None = None, *, others: int = 0
     `job` is the id of the job that the command was waiting for; `others` is the number of further submitted, unfinished jobs.
     """
     if isinstance(fault, KeyboardInterrupt):
-        if job is None:
-            return "Interrupted."
-        if others > 0:
-            rest = "1 other" if others == 1 else f"{others} others"
-            return (
-                f"Interrupted. Job {job} and {rest} continue: repeat the command to follow all of them, "
-                f"`pliant watch {job}` follows this one, `pliant cancel {job}` stops it."
-            )
-        return f"Interrupted. Job {job} continues: `pliant watch {job}` follows it, `pliant cancel {job}` stops it."
+        return "Interrupted." if job is None else f"Interrupted. {_how_to_return(job, others)}"
+    if job is not None and f"during the wait for job {job}" in str(fault):
+        from pliant.client.retry import CALL_AGAIN
+
+        # A repeated `pliant submit` without id or key would submit a second job.
+        return str(fault).replace(CALL_AGAIN, _how_to_return(job, others))
     if hasattr(fault, "format_message"):  # of Click or Typer
         return str(fault.format_message())
     if isinstance(fault, OSError) and fault.strerror is not None and type(fault).__module__ == "builtins":
         name = "" if fault.filename is None else f"{os.fsdecode(fault.filename)}: "
         return f"{name}{fault.strerror}."
     return str(fault) or type(fault).__name__
+
+
+def _how_to_return(job: str, others: int) -> str:
+    """Return a sentence on how to follow the job that the command was waiting for, and `others`."""
+    if others > 0:
+        rest = "1 other" if others == 1 else f"{others} others"
+        return (
+            f"Job {job} and {rest} continue: repeat the command to follow all of them, "
+            f"`pliant watch {job}` follows this one, `pliant cancel {job}` stops it."
+        )
+    return f"Job {job} continues: `pliant watch {job}` follows it, `pliant cancel {job}` stops it."
 
 
 OF_PYDANTIC = "Value error, "

@@ -35,6 +35,9 @@ OUT_OF_STEP = frozenset({"upload_offset_mismatch", "upload_busy", "upload_taken_
 SUBMISSION = "the submission"
 """Operation after whose timeout a repeated call could make a second job."""
 
+CALL_AGAIN = "Nothing was cancelled; call again, or use a longer timeout."
+"""Advice after the timeout of any other operation."""
+
 NOT_EXECUTED = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout, TooManyRequests)
 """Errors after which the service has certainly not executed the call."""
 
@@ -133,7 +136,7 @@ class Attempts:
                 "The job may have been accepted: look for it in the list of jobs, or submit again with the same idempotency_key, "
                 "which never makes a second job."
             )
-        return "Nothing was cancelled; call again, or use a longer timeout."
+        return CALL_AGAIN
 
     def bounding(self, on_bytes: OnBytes | None) -> OnBytes:
         """Return `on_bytes` as a callback that raises `WaitTimeout` once the deadline has passed, in the middle of a body."""

@@ -339,7 +339,10 @@ def test_the_id_is_printed_before_waiting(run: Run, tracks: Path, service: InMem
     ran = run("submit", tracks, "-m", "none", "--id", "early", "--wait", "--timeout", "3")
     assert ran.exit_code == Exit.TIMEOUT
     assert words(ran).startswith("Job early")
-    assert "The timeout of 3 s passed during the wait for job early" in words(ran)
+    assert (
+        "The timeout of 3 s passed during the wait for job early. Job early continues: `pliant watch early` follows it"
+        in words(ran)
+    )
     run("cancel", "early")
 
 
