@@ -119,6 +119,7 @@ def test_unicode_text_of_a_spreadsheet_is_read(mark: bytes, encoding: str, tmp_p
     (tmp_path / "tracks.txt").write_bytes(mark + text.encode(encoding))
     read = read_inputs(tracks=tmp_path / "tracks.txt", mesh="none", options=Options())
     assert read.interpretation.format == "one row a frame"
+    assert "Recognised by the names in the file: one row a frame." in read.interpretation.notes
     np.testing.assert_allclose(read.tracks.points[SURE > 0.5], POINTS[SURE > 0.5])
 
 

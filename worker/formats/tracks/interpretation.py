@@ -93,7 +93,7 @@ def understand(arrays: Arrays, options: Options, *, file: Path | None = None) ->
     known = depths is not None and options.y_axis == "auto"
     y_axis, why = ("down", []) if known else upwards(sampled(placed.points, visible), options)
     layout = reading.layout if flat.grid is None else f"{reading.layout}, P = {flat.grid[0]} × {flat.grid[1]} pixels"
-    whose = [] if dialect.name in PLAIN else [f"Recognised as the output of {dialect.name} by the names in the file."]
+    whose = [] if dialect.name in PLAIN else [f"Recognised by the names in the file: {dialect.name}."]
     if dialect.note and options.coordinate_order == "auto":
         whose.append(dialect.note)
     names = _names(named, placed.points.shape[1], ordered=reading.order == "frames_points")
