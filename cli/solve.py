@@ -139,7 +139,7 @@ def inspect(
     ] = "",
     as_json: Json = False,
 ) -> None:
-    """Show how a track file is interpreted, or a film's properties and estimated tracking time, without solving."""
+    """Show how a track file is interpreted, or a film's properties, with estimates of time and memory, without solving."""
     ctx.obj.json = as_json
     check_inputs(file, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=region)
     options = parse_options(option)
