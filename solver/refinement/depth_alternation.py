@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.aimed import Aimed, towards
 from pliant.solver.cameras.factorization import upgrades
 from pliant.solver.cameras.multistart import CANDIDATES
-from pliant.solver.cameras.perspective import Perspective, corrected, depths_of
+from pliant.solver.cameras.perspective import Perspective, corrected, depth_map, depths_of
 from pliant.solver.model.marginal_likelihood import UNLIKELY
 from pliant.solver.model.so3 import MIRROR, nearest
 from pliant.solver.pulse import never
@@ -42,6 +42,8 @@ def alternate(
 ) -> tuple[Learned, Perspective]:
     """Return cameras, covariance and κ after rounds of alternation, which end before a round whose depths diverge.
 
+    If that is the first one and the depths of `found` diverge, too, its energy is set to `UNLIKELY`.
+
     Parameters
     ----------
     view : Perspective
@@ -55,7 +57,7 @@ def alternate(
     rounds : int
         Maximum number of rounds.
     """
-    views = view.learning_sample[used]
+    views, start = view.learning_sample[used], found
     for _ in range(rounds):
         if how.should_stop():
             break
@@ -66,10 +68,21 @@ def alternate(
         moved, inverse_focal = refine_with_focal(
             views, moved, view.inverse_focal, free=view.given is None, turning=how.turning
         )
-        if moved.energy >= UNLIKELY:
+        if moved.energy >= UNLIKELY or not _ahead(views, moved, inverse_focal):
             break
         found, view = moved, replace(view, inverse_focal=inverse_focal)
+    if found is start and found.energy < UNLIKELY and not _ahead(views, found, view.inverse_focal):
+        found = replace(found, energy=UNLIKELY)
     return found, view
+
+
+def _ahead(views: Floats, found: Learned, inverse_focal: float) -> bool:
+    """Whether every point lies in front of its camera; some do not where the fixed-point steps of `depths_of` diverge."""
+    try:
+        depths = depths_of(depth_map(found.rotations, found.scales, found.covariance), views, inverse_focal)
+    except np.linalg.LinAlgError:
+        return False
+    return bool((1 + inverse_focal * depths).min() > 0)
 
 
 def refactorize(

@@ -101,11 +101,16 @@ def _restart(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evide
 
 
 def update_correction(evidence: Evidence, found: Learned, how: Refinement) -> tuple[Evidence, Learned]:
-    """Return the evidence with tracks corrected for refined cameras and covariance `found`, and these refined once more."""
+    """Return the evidence with tracks corrected for refined cameras and covariance `found`, and these refined once more.
+
+    If the depths diverge, both are returned unchanged.
+    """
     view, scales = evidence.estimate.perspective, evidence.start_scales[evidence.used]
     assert view is not None
     absolute = replace(found, scales=found.scales * scales)
     absolute, view = alternate(view, absolute, evidence.used, how)
+    if absolute.energy >= UNLIKELY:
+        return evidence, found
     return _with_corrected_tracks(evidence, absolute, view), replace(absolute, scales=absolute.scales / scales)
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +12,9 @@ from pliant.solver import Settings, Tracks, gallery, solve
 from pliant.solver.cameras.perspective import MIRROR, Perspective, depth_map
 from pliant.solver.evaluation.metrics import e3d_frame_scaled
 from pliant.solver.model.expectation_maximisation import ModelOrder, annealed
-from pliant.solver.model.so3 import angles_between, exponential
-from pliant.solver.refinement import depth_rounds
+from pliant.solver.model.marginal_likelihood import UNLIKELY
+from pliant.solver.model.so3 import angles_between, exponential, logarithm
+from pliant.solver.refinement import depth_alternation, depth_rounds
 from pliant.solver.refinement.depth_alternation import aligned, alternate, refactorize
 from pliant.solver.refinement.learned import Learned, Refinement
 from pliant.solver.tracks.matrix import centred, columns
@@ -71,6 +74,35 @@ def test_a_round_that_leads_to_extreme_depths_is_discarded(
     found, moved = alternate(view, given, np.arange(12), Refinement())
     assert found is given
     assert moved is view
+
+
+def test_a_round_that_places_points_behind_a_camera_is_discarded(
+    rigid: tuple[np.ndarray, Perspective, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rotations, view, gram = rigid
+    given = Learned(rotations, np.ones(12), annealed(gram, rotations[:, :2], ModelOrder(), iterations=5), np.inf)
+    refined = depth_alternation.refine_with_focal
+
+    def turned_less(*arguments: Any, **options: Any) -> tuple[Learned, float]:
+        """Cameras that explain the tracks by ten times the depth."""
+        found, inverse_focal = refined(*arguments, **options)
+        rotations = exponential(logarithm(found.rotations) / 10)
+        return replace(found, rotations=rotations, energy=-10.0), inverse_focal
+
+    found, moved = alternate(view, given, np.arange(12), Refinement())
+    assert found is not given
+    monkeypatch.setattr(depth_alternation, "refine_with_focal", turned_less)
+    found, moved = alternate(view, given, np.arange(12), Refinement())
+    assert found is given
+    assert moved is view
+    flat = replace(given, rotations=exponential(logarithm(given.rotations) / 10), energy=-10.0)
+    found, moved = alternate(view, flat, np.arange(12), Refinement())
+    assert found.energy == UNLIKELY
+    assert found.rotations is flat.rotations
+    evidence: Any = SimpleNamespace(
+        estimate=SimpleNamespace(perspective=view), start_scales=np.ones(12), used=np.arange(12)
+    )
+    assert depth_rounds.update_correction(evidence, flat, Refinement()) == (evidence, flat)
 
 
 def rolled_and_turned(frames: int, points: int) -> Tracks:
