@@ -47,6 +47,9 @@ SWITCHES = ("allow_http", "allow_invalid_certificates", "http1_only", "http2_onl
 TEXTS = ("proxy_url", "proxy_ca_certificate", "proxy_excludes", "user_agent")
 """Connection options for S3, set by the `AWS_…` variables of the same names."""
 
+LONGEST_MESSAGE = 2000
+"""Characters of a store's message that are logged: it may contain a proxy's page."""
+
 FAULTS_OF_DISKS = tuple(os.strerror(number) for number in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES))
 """The system's sentences for a directory that takes no files; they name no path."""
 
@@ -317,13 +320,14 @@ def _linked(source: Path, target: Path) -> bool:
 def answering() -> Iterator[None]:
     """Translate failures of the store to `StoreUnavailable`; a missing file stays `FileNotFoundError`.
 
-    The store's message is only logged, since it contains endpoint, bucket and key.
+    The store's message is only logged, since it contains endpoint, bucket and key. It has several lines: an S3 server's reason is in the
+    second, the reason for which a connection failed in the last.
     """
     try:
         yield
     except FileNotFoundError:
         raise
     except (BaseError, OSError) as error:
-        logger.warning("blob store: %s", str(error).splitlines()[0][:300])
+        logger.warning("blob store: %s", " ".join(str(error).split())[:LONGEST_MESSAGE])
         reason = next((fault for fault in FAULTS_OF_DISKS if fault in str(error)), type(error).__name__)
         raise StoreUnavailable("The blob store", reason=reason) from error
