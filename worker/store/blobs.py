@@ -124,7 +124,7 @@ class Blobs:
         Raises
         ------
         InvalidSetting
-            The text is not a URL, or one of another kind of store.
+            The text is not a URL, or one of another kind of store; or an `AWS_…` variable is invalid.
         """
         if url.startswith("memory:"):
             return cls(MemoryStore())
@@ -135,14 +135,22 @@ class Blobs:
                     raise InvalidSetting("PLIANT_BLOB_URL", expected=expected, got=repr(url))
                 store = from_url(url, mkdir=True, automatic_cleanup=True)
                 return cls(store, directory=Path(unquote(urlsplit(url).path)))
-            options: Any = {**CLIENT, **client_options(os.environ)}
             try:
                 scheme, bucket, *_ = urlsplit(url)
                 if scheme != "s3" or not bucket:
                     raise ValueError(url)
-                return cls(from_url(url, client_options=options, retry_config=RETRIES), remote=True)
             except ValueError:
                 raise InvalidSetting("PLIANT_BLOB_URL", expected=expected, got=repr(url)) from None
+            options: Any = {**CLIENT, **client_options(os.environ)}
+            try:
+                return cls(from_url(url, client_options=options, retry_config=RETRIES), remote=True)
+            except (ValueError, BaseError) as fault:
+                raise InvalidSetting(
+                    "AWS_… variables",
+                    expected=f"values with which {url} can be opened",
+                    got=f"the error {str(fault).splitlines()[0]!r}",
+                    hint="docs/how-to/s3.md lists the variables.",
+                ) from None
 
     def put(self, key: str, file: Path, *, media_type: str = "application/octet-stream") -> int:
         """Store a file atomically and durably; return its size in bytes.
@@ -287,6 +295,11 @@ def client_options(environment: Mapping[str, str]) -> dict[str, object]:
 
     obstore itself reads those for credentials, region and endpoint. `AWS_TIMEOUT` and `AWS_CONNECT_TIMEOUT` have no effect, because
     the time limits here depend on each other.
+
+    Raises
+    ------
+    InvalidSetting
+        The file of `AWS_CA_BUNDLE` cannot be read.
     """
     given: dict[str, object] = {}
     for name in SWITCHES:
@@ -298,7 +311,12 @@ def client_options(environment: Mapping[str, str]) -> dict[str, object]:
             given[name] = text
     certificates = environment.get("AWS_CA_BUNDLE", "").strip()
     if certificates:
-        given["root_certificate"] = Path(certificates).read_text()
+        try:
+            given["root_certificate"] = Path(certificates).read_text()
+        except (OSError, ValueError) as fault:
+            raise InvalidSetting(
+                "AWS_CA_BUNDLE", expected="a PEM file that this user can read", got=str(fault)
+            ) from None
     return given
 
 

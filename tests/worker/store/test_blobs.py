@@ -289,6 +289,30 @@ def test_connection_variables_are_passed_to_the_store(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        (
+            "AWS_CA_BUNDLE",
+            "/no/such/file",
+            "AWS_CA_BUNDLE: expected a PEM file that this user can read, got .*No such file",
+        ),
+        ("AWS_CA_BUNDLE", __file__, "AWS_… variables: .*No certificates found"),
+        (
+            "AWS_SKIP_SIGNATURE",
+            "maybe",
+            "AWS_… variables: expected values with which s3://bucket/prefix can be opened, .*boolean",
+        ),
+    ],
+)
+def test_an_invalid_store_variable_is_named_in_place_of_the_url(
+    name: str, value: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(name, value)
+    with pytest.raises(InvalidSetting, match=words):
+        Blobs.open("s3://bucket/prefix")
+
+
+@pytest.mark.parametrize(
     "url", ["/srv/blobs", "ftp://host/blobs", "s3:///blobs", "s3://[bucket/blobs", "file://host/blobs", "file:blobs"]
 )
 def test_blob_stores_of_other_kinds_are_refused(url: str) -> None:
