@@ -255,6 +255,10 @@ def test_doctor_checks_the_queue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             (found,) = doctor.check_valkey()
             assert found.verdict == "bad", wrong
             assert "wrong" not in found.found
+        monkeypatch.setenv("PLIANT_REDIS_URL", f"redis://127.0.0.1:{port}/0")
+        (found,) = doctor.check_valkey()
+        assert found.found == f"redis://127.0.0.1:{port} cannot be used (it refuses the password)"
+        assert "password in PLIANT_REDIS_URL" in found.advice
         client = redis.Redis(port=port, password="secret")
         client.config_set("maxmemory-policy", "allkeys-lru")
         client.close()
