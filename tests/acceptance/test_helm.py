@@ -118,6 +118,18 @@ def test_containers_run_with_least_privilege(objects: list[dict[str, Any]]) -> N
         assert "startupProbe" in each or each["name"] == "first-token"
 
 
+def test_settings_replace_defaults_and_none_of_the_variables_that_the_chart_sets() -> None:
+    """Kubernetes may refuse a list that names a variable twice, and of two values only the last one has an effect."""
+    console = rendered({"settings": {"PLIANT_LOG_FORMAT": "console"}})
+    for each in containers(console):
+        values = [variable["value"] for variable in each["env"] if variable["name"] == "PLIANT_LOG_FORMAT"]
+        assert values == (["console"] if each["image"].startswith("pliant:") else [])
+    own = {variable["name"] for each in containers(rendered(EVERYTHING)) for variable in each["env"]}
+    for name in {name for name in own if name.startswith("PLIANT_")} - {"PLIANT_LOG_FORMAT", "PLIANT_RETENTION"}:
+        with pytest.raises(Exception, match=f"settings.{name}: the chart sets this variable itself"):
+            rendered({"settings": {name: "1"}})
+
+
 def test_selectors_match_their_pods_and_mounted_volumes_exist(objects: list[dict[str, Any]]) -> None:
     labels = {name: pod["metadata"]["labels"] for name, pod in pods(objects).items()}
 

@@ -56,9 +56,11 @@ capabilities: {drop: [ALL]}
 {{- else }}
   value: file:///data/shared/blobs
 {{- end }}
-- name: PLIANT_LOG_FORMAT
-  value: json
-{{- range $name, $value := .Values.settings }}
+{{- $own := list "DATA" "REDIS_URL" "BLOB_URL" "HOST" "PORT" "AUTH" "PARSERS" "READ_MEMORY" "ALLOWED_HOSTS" "THREADS" "MEMORY_LIMIT" "STOP_GRACE" }}
+{{- range $name, $value := merge (dict) .Values.settings (dict "PLIANT_LOG_FORMAT" "json") }}
+{{- if has (trimPrefix "PLIANT_" $name) $own }}
+{{- fail (printf "settings.%s: the chart sets this variable itself; values.yaml names the value for it, if there is one" $name) }}
+{{- end }}
 - name: {{ $name }}
   value: {{ $value | quote }}
 {{- end }}
