@@ -130,6 +130,23 @@ def test_settings_replace_defaults_and_none_of_the_variables_that_the_chart_sets
             rendered({"settings": {name: "1"}})
 
 
+def test_annotations_of_the_ingress_replace_the_usual_ones() -> None:
+    def passed(annotations: dict[str, str]) -> dict[str, str]:
+        values = {"ingress": {"enabled": True, "host": "pliant.example.org", "annotations": annotations}}
+        with helm().Chart.load(CHART) as chart:
+            text = chart.render(values, name="demo", namespace="ns")["pliant/templates/rest.yaml"]
+        assert text.count("proxy-read-timeout") == 1, "a mapping with a name twice is refused by many tools"
+        (ingress,) = (each for each in yaml.safe_load_all(text) if each and each["kind"] == "Ingress")
+        return {name.rpartition("/")[2]: value for name, value in ingress["metadata"]["annotations"].items()}
+
+    usual = {
+        "proxy-body-size": "0", "proxy-request-buffering": "off", "proxy-buffering": "off", "proxy-read-timeout": "120",
+    }  # fmt: skip
+    assert passed({}) == usual
+    longer = passed({"nginx.ingress.kubernetes.io/proxy-read-timeout": "300", "example.org/team": "motion"})
+    assert longer == {**usual, "proxy-read-timeout": "300", "team": "motion"}
+
+
 def test_selectors_match_their_pods_and_mounted_volumes_exist(objects: list[dict[str, Any]]) -> None:
     labels = {name: pod["metadata"]["labels"] for name, pod in pods(objects).items()}
 
