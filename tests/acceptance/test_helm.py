@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -68,6 +69,18 @@ def pods(objects: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
 def containers(objects: list[dict[str, Any]]) -> list[dict[str, Any]]:
     specs = [pod["spec"] for pod in pods(objects).values()]
     return [each for spec in specs for each in (*spec["containers"], *spec.get("initContainers", ()))]
+
+
+def test_the_schema_describes_every_value() -> None:
+    def check(values: dict[str, Any], schema: dict[str, Any]) -> None:
+        for name, value in values.items():
+            assert name in schema["properties"], name
+            if isinstance(value, dict) and "properties" in schema["properties"][name]:
+                assert schema["properties"][name]["additionalProperties"] is False, name
+                check(value, schema["properties"][name])
+
+    schema = json.loads((CHART / "values.schema.json").read_text())
+    check(yaml.safe_load((CHART / "values.yaml").read_text()), schema)
 
 
 def test_helm_lint_passes() -> None:
@@ -232,6 +245,10 @@ def test_the_generated_token_and_redis_url_are_well_formed(tmp_path: Path) -> No
         ({"storage": {"type": "s3"}}, "storage.s3.url"),
         ({"storage": {"type": "nfs"}}, "storage"),
         ({"settings": {"RETENTION": "1"}}, "'RETENTION' does not match"),
+        ({"ingress": {"enable": True}}, "additional properties 'enable' not allowed"),
+        ({"storage": {"s3": {"endpont": "http://minio:9000"}}}, "additional properties 'endpont' not allowed"),
+        ({"workers": {"replicas": 2}}, "additional properties 'workers' not allowed"),
+        ({"ingress": {"annotations": {"nginx.ingress.kubernetes.io/proxy-read-timeout": 300}}}, "want string"),
         ({"valkey": {"maxmemory": "60%"}}, "'60%' does not match"),
         ({"api": {"replicas": 2}, "storage": {"pvc": {"accessMode": "ReadWriteOnce"}}}, "ReadWriteMany"),
     ],
