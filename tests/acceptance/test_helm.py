@@ -238,6 +238,19 @@ def test_the_generated_token_and_redis_url_are_well_formed(tmp_path: Path) -> No
     assert of(rendered({**S3, **EXTERNAL}), "Secret") == {}
 
 
+def test_given_secrets_replace_those_that_every_rendering_makes_anew() -> None:
+    """Tools that render the chart without the cluster would set another password at every synchronisation."""
+    objects = rendered({"redis": {"existingSecret": "mine"}, "firstToken": {"existingSecret": "token"}})
+    assert of(objects, "Secret") == {}
+    used = {
+        (variable["name"], variable["valueFrom"]["secretKeyRef"]["name"], variable["valueFrom"]["secretKeyRef"]["key"])
+        for each in containers(objects)
+        for variable in each["env"]
+        if "valueFrom" in variable
+    }
+    assert used == {("PLIANT_REDIS_URL", "mine", "url"), ("REDISCLI_AUTH", "mine", "password")}
+
+
 @pytest.mark.parametrize(
     ("values", "words"),
     [

@@ -10,7 +10,7 @@ app.kubernetes.io/managed-by: {{ .Release.Service }}
 {{- end }}
 
 {{- define "pliant.redisSecret" -}}
-{{- if .Values.valkey.enabled }}{{ .Release.Name }}-redis{{ else }}{{ required "redis.existingSecret names the Secret with the URL, where valkey.enabled is false" .Values.redis.existingSecret }}{{ end }}
+{{- if .Values.redis.existingSecret }}{{ .Values.redis.existingSecret }}{{ else if .Values.valkey.enabled }}{{ .Release.Name }}-redis{{ else }}{{ fail "redis.existingSecret names the Secret with the URL, where valkey.enabled is false" }}{{ end }}
 {{- end }}
 
 {{- define "pliant.tokenSecret" -}}
