@@ -238,6 +238,17 @@ def test_the_generated_token_and_redis_url_are_well_formed(tmp_path: Path) -> No
     assert of(rendered({**S3, **EXTERNAL}), "Secret") == {}
 
 
+def test_a_backup_can_be_restored_before_api_and_reconciler_start() -> None:
+    """The API's pod creates the first token, and only an installation without tokens can be restored."""
+    values = {"api": {"replicas": 0}, "worker": {"replicas": 0}}
+    with helm().Chart.load(CHART) as chart:
+        chart.validate_schema(values)
+    stopped = {name: each["spec"]["replicas"] for name, each in of(rendered(values), "Deployment").items()}
+    assert stopped == {"demo-api": 0, "demo-worker": 0, "demo-reconciler": 0}
+    usual = of(rendered({"api": {"replicas": 3}}), "Deployment")
+    assert usual["demo-reconciler"]["spec"]["replicas"] == 1
+
+
 def test_given_secrets_replace_those_that_every_rendering_makes_anew() -> None:
     """Tools that render the chart without the cluster would set another password at every synchronisation."""
     objects = rendered({"redis": {"existingSecret": "mine"}, "firstToken": {"existingSecret": "token"}})
