@@ -21,9 +21,20 @@ def check_settings(settings: Settings) -> None:
     Raises
     ------
     InvalidSetting
-        The workers do not fit into the memory, or the URL of a store is malformed or names a folder that cannot be made.
+        The workers do not fit into the memory, or a store cannot be used; see `check_stores`.
     """
     check_workers(settings)
+    check_stores(settings)
+
+
+def check_stores(settings: Settings) -> None:
+    """Check the URLs of the stores; no server is called.
+
+    Raises
+    ------
+    InvalidSetting
+        The URL of a store is malformed or names a folder that cannot be made.
+    """
     # The clients are imported for given URLs only: they would stay in the memory of this process.
     if settings.redis_url is not None:
         from pliant.worker.store.connection import connect

@@ -348,6 +348,18 @@ def test_a_data_directory_that_cannot_be_made_is_named(settings: Settings, tmp_p
 
 
 @pytest.mark.slow
+def test_a_blob_folder_that_cannot_be_made_is_named(settings: Settings, tmp_path: Path) -> None:
+    """By each process that may be started alone, as by `pliant up`; they said that the store is unavailable, and to try again."""
+    (tmp_path / "file").touch()
+    url = (tmp_path / "file" / "blobs").as_uri()
+    env = {**os.environ, **settings.to_environment(), "PLIANT_BLOB_URL": url}
+    for command in (["pliant.worker", "work"], ["pliant.worker", "reconcile"], ["pliant.service"]):
+        ended = subprocess.run([sys.executable, "-m", *command], capture_output=True, text=True, check=False, env=env)
+        assert ended.returncode in (1, 2)
+        assert f"PLIANT_BLOB_URL: expected a folder that exists or can be made, got '{url}'" in ended.stderr
+
+
+@pytest.mark.slow
 def test_the_fsck_command_reports_inconsistencies(house: House) -> None:
     command = [sys.executable, "-m", "pliant.cli", "fsck"]
     env = {**os.environ, **house.settings.to_environment()}
