@@ -327,7 +327,7 @@ def show(findings: list[Finding]) -> None:
     signs = {"good": Text("✓", "green"), "note": Text("·", "yellow"), "bad": Text("✗", "red")}
     table = Table.grid(padding=(0, 1))
     for finding in findings:
-        words = Text(finding.found)
+        words = Text(finding.found, overflow="fold")  # never an ellipsis in place of the end of a path
         if finding.advice != "":
             words.append(f"\n→ {finding.advice}", "bold")
         table.add_row(signs[finding.verdict], Text(finding.what, "dim"), words)

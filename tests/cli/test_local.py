@@ -301,6 +301,13 @@ def test_doctor_checks_the_blob_store(tmp_path: Path, monkeypatch: pytest.Monkey
     assert "AWS_" in found.advice
 
 
+def test_long_paths_are_folded_and_not_cut_off(capsys: pytest.CaptureFixture[str]) -> None:
+    """As in the mail of a daily `pliant fsck`."""
+    path = "jobs/" + "0123456789" * 12 + "/artifacts/shapes.npz"
+    doctor.show([doctor.Finding("stored", "bad", f"File {path} belongs to no job.", "Report it.")])
+    assert path in "".join(capsys.readouterr().out.split())
+
+
 def test_doctor_and_fsck_read_env_and_secret_files_as_the_service_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
