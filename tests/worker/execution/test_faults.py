@@ -261,7 +261,7 @@ def test_a_job_missing_from_the_queue_is_completed(house: House) -> None:
 
 
 @pytest.mark.slow
-def test_lost_inputs_are_an_internal_error_with_a_traceback_in_the_log(house: House) -> None:
+def test_lost_inputs_are_a_storage_failure_with_a_traceback_in_the_log(house: House) -> None:
     first, second = house.submit(long=True), house.submit(long=True)
     house.solving(first)
     house.solving(second)
@@ -271,7 +271,8 @@ def test_lost_inputs_are_an_internal_error_with_a_traceback_in_the_log(house: Ho
     house.jobs.cancel(second)
     job = house.final(id)
     assert job.error is not None
-    assert (job.error.code, job.error.status) == ("internal_error", 500)
+    assert (job.error.code, job.error.status) == ("storage_failed", 503)
+    assert "A stored file of the job is missing" in job.error.detail
     assert "Traceback" not in job.error.detail
     assert "Traceback" in house.jobs.log(id)
     house.final(first)
