@@ -4,12 +4,14 @@
 ARG PYTHON=python:3.12.12-slim-bookworm
 
 FROM ${PYTHON} AS build
+# For example server,usd,otel: see docs/how-to/install.md.
+ARG EXTRAS=server
 WORKDIR /source
 COPY . .
 ENV PLIANT_PAGE=required PIP_DISABLE_PIP_VERSION_CHECK=1
 RUN --mount=type=cache,target=/root/.cache/pip \
     python -m venv /opt/pliant \
-    && /opt/pliant/bin/python -m pip install --constraint constraints.txt '.[server]'
+    && /opt/pliant/bin/python -m pip install --constraint constraints.txt ".[${EXTRAS}]"
 
 FROM ${PYTHON}
 ARG VERSION=0.1.0

@@ -327,7 +327,7 @@ def show(findings: list[Finding]) -> None:
     signs = {"good": Text("✓", "green"), "note": Text("·", "yellow"), "bad": Text("✗", "red")}
     table = Table.grid(padding=(0, 1))
     for finding in findings:
-        words = Text(finding.found)
+        words = Text(finding.found, overflow="fold")  # never an ellipsis in place of the end of a path
         if finding.advice != "":
             words.append(f"\n→ {finding.advice}", "bold")
         table.add_row(signs[finding.verdict], Text(finding.what, "dim"), words)
@@ -348,7 +348,7 @@ def check_blobs() -> Iterator[Finding]:
         blobs.write(probe := f"doctor/{time.time_ns()}", b"")
         blobs.delete(probe)
     except InvalidSetting as fault:
-        yield Finding("blobs", "bad", str(fault), "Correct the address.")
+        yield Finding("blobs", "bad", str(fault), "Correct the setting.")
     except StoreUnavailable as fault:
         advice = "Check the address, the bucket and the AWS_ variables; the store's own message is above."
         yield Finding("blobs", "bad", f"{url} cannot be used ({fault.reason})", advice)
@@ -358,7 +358,9 @@ def check_blobs() -> Iterator[Finding]:
 
 def _redis(address: str) -> Finding:
     """Check that the server accepts the credentials of the address, and that it does not evict keys."""
-    advice = "Start that server, or unset PLIANT_REDIS_URL to use the embedded one."
+    advice = (
+        "Check that the server runs, and address and password in PLIANT_REDIS_URL; unset it to use the embedded one."
+    )
     from pliant.worker.errors import InvalidSetting, StoreUnavailable
     from pliant.worker.store.connection import check_server
     from pliant.worker.store.outage import address_of
@@ -368,7 +370,7 @@ def _redis(address: str) -> Finding:
     except InvalidSetting as fault:
         return Finding("queue", "bad", str(fault), "Correct the address.")
     except StoreUnavailable as fault:
-        return Finding("queue", "bad", f"{address_of(address)}: {fault}", advice)
+        return Finding("queue", "bad", f"{address_of(address)} cannot be used ({fault.reason})", advice)
     where = address_of(address)
     if policy not in ("noeviction", ""):
         remedy = "Set maxmemory-policy to noeviction: a server that evicts keys loses jobs."

@@ -19,7 +19,7 @@ from pliant.worker.environment import variable_of, warnings_of_unknown
 from pliant.worker.errors import InvalidSetting, StoreUnavailable, WorkerError
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.logs import configure_logging
-from pliant.worker.processes.preflight import open_data_directory
+from pliant.worker.processes.preflight import check_process, open_data_directory
 from pliant.worker.settings import Settings
 from pliant.worker.tokens import Tokens
 
@@ -107,6 +107,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         tokens = Tokens.open(of_worker)
         check_access(settings, tokens)
         open_data_directory(of_worker)
+        check_process(of_worker)
         tracing.configure(of_worker.tracing, service="pliant-api")
         jobs = Jobs.open(of_worker)
         with suppress(StoreUnavailable):  # requests are answered 503 until the store is back

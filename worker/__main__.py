@@ -16,7 +16,7 @@ from pliant.worker.execution.rq_worker import PliantWorker
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.logs import LogSettings, configure_logging
 from pliant.worker.maintenance.reconciler import Reconciler
-from pliant.worker.processes.preflight import open_data_directory
+from pliant.worker.processes.preflight import check_process, open_data_directory
 from pliant.worker.settings import NUMERICAL_THREADS, Settings
 from pliant.worker.store.connection import BLOCK_WITHIN, connect, reachable
 from pliant.worker.store.outage import described
@@ -101,6 +101,7 @@ def main(arguments: list[str]) -> int:
     try:
         logs, settings = read(LogSettings), Settings.from_environment()
         configure_logging(logs.log_level, logs.log_format)
+        check_process(settings)
         try:
             return task(settings)
         except StoreUnavailable as error:

@@ -80,7 +80,8 @@ class Settings:
     """Time for a job to stop by itself after a cancellation or its time limit, before it is killed."""
 
     stop_grace: Seconds = 10.0
-    """Time for a running job to finish after SIGTERM, before it is requeued."""
+    """Time for a running job to finish after SIGTERM, before it is requeued. Whatever stops the processes must wait 30 s longer:
+    `TimeoutStopSec` of systemd, `stop_grace_period` of Compose."""
 
     lost_after: float = Field(default=10.0, ge=1, allow_inf_nan=False, description="a number of seconds, at least 1")
     """Time without heartbeats after which a running job is requeued."""

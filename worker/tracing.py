@@ -6,6 +6,7 @@ another host, continues the same trace. OpenTelemetry is imported only if tracin
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
 from collections.abc import Iterator
@@ -16,6 +17,13 @@ from typing import Any
 from pliant.worker.errors import InvalidSetting
 
 logger = logging.getLogger(__name__)
+
+MODULES = {
+    "off": (),
+    "console": ("opentelemetry.sdk.trace.export",),
+    "otlp": ("opentelemetry.sdk.trace.export", "opentelemetry.exporter.otlp.proto.http.trace_exporter"),
+}
+"""The modules of OpenTelemetry that each kind of tracing needs."""
 
 _provider: Any = None
 """The process's `TracerProvider`; None: tracing is off."""
@@ -31,20 +39,33 @@ def configure(kind: str, *, service: str) -> None:
     InvalidSetting
         The extra `otel` is not installed.
     """
+    check(kind)
     if kind == "off":
         use(None)
         return
-    try:
-        from opentelemetry.sdk.resources import SERVICE_NAME, Resource
-        from opentelemetry.sdk.trace import TracerProvider
-        from opentelemetry.sdk.trace.export import BatchSpanProcessor
+    from opentelemetry.sdk.resources import SERVICE_NAME, Resource
+    from opentelemetry.sdk.trace import TracerProvider
+    from opentelemetry.sdk.trace.export import BatchSpanProcessor
 
-        provider = TracerProvider(resource=Resource.create({SERVICE_NAME: service}))
-        provider.add_span_processor(BatchSpanProcessor(_exporter(kind)))
+    provider = TracerProvider(resource=Resource.create({SERVICE_NAME: service}))
+    provider.add_span_processor(BatchSpanProcessor(_exporter(kind)))
+    use(provider)
+
+
+def check(kind: str) -> None:
+    """Check that tracing can be configured, without configuring it: a worker must know before it takes jobs.
+
+    Raises
+    ------
+    InvalidSetting
+        The extra `otel` is not installed.
+    """
+    try:
+        for module in MODULES[kind]:
+            importlib.import_module(module)
     except ImportError as error:
         expected = "off, or the extra otel (pip install '.[otel]' in Pliant's source folder)"
         raise InvalidSetting("PLIANT_TRACING", expected=expected, got=kind) from error
-    use(provider)
 
 
 def use(provider: Any) -> None:

@@ -54,7 +54,13 @@ class OriginCheck:
             detail = (
                 "A page of another site may not write here. The operator can add its origin to PLIANT_CORS_ORIGINS."
             )
-            return answer(ProblemCode.CROSS_SITE_REQUEST, detail=detail, field="Origin", got=(origin or "")[:80])
+            return answer(
+                ProblemCode.CROSS_SITE_REQUEST,
+                detail=detail,
+                field="Origin",
+                expected=host[:80],
+                got=(origin or "")[:80],
+            )
         return None
 
 

@@ -112,6 +112,13 @@ def test_the_image_is_pinned_labelled_unprivileged_and_minimal() -> None:
     assert "USER 10001" in last
 
 
+def test_the_image_can_be_built_with_further_extras() -> None:
+    build = DOCKERFILE.rpartition("FROM ${PYTHON}")[0]
+    (extras,) = re.findall(r"^ARG EXTRAS=(.*)$", build.partition("FROM ${PYTHON}")[2], re.MULTILINE)
+    assert extras == "server"
+    assert '".[${EXTRAS}]"' in build
+
+
 def test_the_passwords_of_compose_reach_no_layer_of_the_build() -> None:
     assert "\nCOPY . .\n" in DOCKERFILE
     assert ".env" in (ROOT / ".dockerignore").read_text().splitlines()

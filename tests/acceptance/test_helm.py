@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -70,6 +71,18 @@ def containers(objects: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [each for spec in specs for each in (*spec["containers"], *spec.get("initContainers", ()))]
 
 
+def test_the_schema_describes_every_value() -> None:
+    def check(values: dict[str, Any], schema: dict[str, Any]) -> None:
+        for name, value in values.items():
+            assert name in schema["properties"], name
+            if isinstance(value, dict) and "properties" in schema["properties"][name]:
+                assert schema["properties"][name]["additionalProperties"] is False, name
+                check(value, schema["properties"][name])
+
+    schema = json.loads((CHART / "values.schema.json").read_text())
+    check(yaml.safe_load((CHART / "values.yaml").read_text()), schema)
+
+
 def test_helm_lint_passes() -> None:
     report = helm().lint(CHART, strict=True)
     assert report["errors"] == []
@@ -116,6 +129,35 @@ def test_containers_run_with_least_privilege(objects: list[dict[str, Any]]) -> N
         }  # fmt: skip
         assert "memory" in each["resources"]["limits"]
         assert "startupProbe" in each or each["name"] == "first-token"
+
+
+def test_settings_replace_defaults_and_none_of_the_variables_that_the_chart_sets() -> None:
+    """Kubernetes may refuse a list that names a variable twice, and of two values only the last one has an effect."""
+    console = rendered({"settings": {"PLIANT_LOG_FORMAT": "console"}})
+    for each in containers(console):
+        values = [variable["value"] for variable in each["env"] if variable["name"] == "PLIANT_LOG_FORMAT"]
+        assert values == (["console"] if each["image"].startswith("pliant:") else [])
+    own = {variable["name"] for each in containers(rendered(EVERYTHING)) for variable in each["env"]}
+    for name in {name for name in own if name.startswith("PLIANT_")} - {"PLIANT_LOG_FORMAT", "PLIANT_RETENTION"}:
+        with pytest.raises(Exception, match=f"settings.{name}: the chart sets this variable itself"):
+            rendered({"settings": {name: "1"}})
+
+
+def test_annotations_of_the_ingress_replace_the_usual_ones() -> None:
+    def passed(annotations: dict[str, str]) -> dict[str, str]:
+        values = {"ingress": {"enabled": True, "host": "pliant.example.org", "annotations": annotations}}
+        with helm().Chart.load(CHART) as chart:
+            text = chart.render(values, name="demo", namespace="ns")["pliant/templates/rest.yaml"]
+        assert text.count("proxy-read-timeout") == 1, "a mapping with a name twice is refused by many tools"
+        (ingress,) = (each for each in yaml.safe_load_all(text) if each and each["kind"] == "Ingress")
+        return {name.rpartition("/")[2]: value for name, value in ingress["metadata"]["annotations"].items()}
+
+    usual = {
+        "proxy-body-size": "0", "proxy-request-buffering": "off", "proxy-buffering": "off", "proxy-read-timeout": "120",
+    }  # fmt: skip
+    assert passed({}) == usual
+    longer = passed({"nginx.ingress.kubernetes.io/proxy-read-timeout": "300", "example.org/team": "motion"})
+    assert longer == {**usual, "proxy-read-timeout": "300", "team": "motion"}
 
 
 def test_selectors_match_their_pods_and_mounted_volumes_exist(objects: list[dict[str, Any]]) -> None:
@@ -196,6 +238,30 @@ def test_the_generated_token_and_redis_url_are_well_formed(tmp_path: Path) -> No
     assert of(rendered({**S3, **EXTERNAL}), "Secret") == {}
 
 
+def test_a_backup_can_be_restored_before_api_and_reconciler_start() -> None:
+    """The API's pod creates the first token, and only an installation without tokens can be restored."""
+    values = {"api": {"replicas": 0}, "worker": {"replicas": 0}}
+    with helm().Chart.load(CHART) as chart:
+        chart.validate_schema(values)
+    stopped = {name: each["spec"]["replicas"] for name, each in of(rendered(values), "Deployment").items()}
+    assert stopped == {"demo-api": 0, "demo-worker": 0, "demo-reconciler": 0}
+    usual = of(rendered({"api": {"replicas": 3}}), "Deployment")
+    assert usual["demo-reconciler"]["spec"]["replicas"] == 1
+
+
+def test_given_secrets_replace_those_that_every_rendering_makes_anew() -> None:
+    """Tools that render the chart without the cluster would set another password at every synchronisation."""
+    objects = rendered({"redis": {"existingSecret": "mine"}, "firstToken": {"existingSecret": "token"}})
+    assert of(objects, "Secret") == {}
+    used = {
+        (variable["name"], variable["valueFrom"]["secretKeyRef"]["name"], variable["valueFrom"]["secretKeyRef"]["key"])
+        for each in containers(objects)
+        for variable in each["env"]
+        if "valueFrom" in variable
+    }
+    assert used == {("PLIANT_REDIS_URL", "mine", "url"), ("REDISCLI_AUTH", "mine", "password")}
+
+
 @pytest.mark.parametrize(
     ("values", "words"),
     [
@@ -203,6 +269,10 @@ def test_the_generated_token_and_redis_url_are_well_formed(tmp_path: Path) -> No
         ({"storage": {"type": "s3"}}, "storage.s3.url"),
         ({"storage": {"type": "nfs"}}, "storage"),
         ({"settings": {"RETENTION": "1"}}, "'RETENTION' does not match"),
+        ({"ingress": {"enable": True}}, "additional properties 'enable' not allowed"),
+        ({"storage": {"s3": {"endpont": "http://minio:9000"}}}, "additional properties 'endpont' not allowed"),
+        ({"workers": {"replicas": 2}}, "additional properties 'workers' not allowed"),
+        ({"ingress": {"annotations": {"nginx.ingress.kubernetes.io/proxy-read-timeout": 300}}}, "want string"),
         ({"valkey": {"maxmemory": "60%"}}, "'60%' does not match"),
         ({"api": {"replicas": 2}, "storage": {"pvc": {"accessMode": "ReadWriteOnce"}}}, "ReadWriteMany"),
     ],

@@ -255,6 +255,10 @@ def test_doctor_checks_the_queue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             (found,) = doctor.check_valkey()
             assert found.verdict == "bad", wrong
             assert "wrong" not in found.found
+        monkeypatch.setenv("PLIANT_REDIS_URL", f"redis://127.0.0.1:{port}/0")
+        (found,) = doctor.check_valkey()
+        assert found.found == f"redis://127.0.0.1:{port} cannot be used (it refuses the password)"
+        assert "password in PLIANT_REDIS_URL" in found.advice
         client = redis.Redis(port=port, password="secret")
         client.config_set("maxmemory-policy", "allkeys-lru")
         client.close()
@@ -295,6 +299,13 @@ def test_doctor_checks_the_blob_store(tmp_path: Path, monkeypatch: pytest.Monkey
     (found,) = doctor.check_blobs()
     assert found.verdict == "bad"
     assert "AWS_" in found.advice
+
+
+def test_long_paths_are_folded_and_not_cut_off(capsys: pytest.CaptureFixture[str]) -> None:
+    """As in the mail of a daily `pliant fsck`."""
+    path = "jobs/" + "0123456789" * 12 + "/artifacts/shapes.npz"
+    doctor.show([doctor.Finding("stored", "bad", f"File {path} belongs to no job.", "Report it.")])
+    assert path in "".join(capsys.readouterr().out.split())
 
 
 def test_doctor_and_fsck_read_env_and_secret_files_as_the_service_does(

@@ -62,7 +62,7 @@ def test_a_folder_of_another_user_is_refused_before_processes_start(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str
 ) -> None:
     monkeypatch.setattr("os.access", lambda path, mode: path != tmp_path / "work")
-    result = run(command, "--data", str(tmp_path))
+    result = run(command, "--data", str(tmp_path), *(["--port", "0"] if command == "up" else []))
     assert result.exit_code == Exit.REFUSED
     sentence = f"PLIANT_DATA: expected a folder that this user can create and write, got '{tmp_path / 'work'}' (Permission denied)"
     assert sentence in result.output
@@ -96,7 +96,7 @@ def test_an_interruption_while_waiting_for_the_store_starts_nothing(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("time.sleep", interrupted)
-    result = run(command, PLIANT_REDIS_URL="redis://:secret@127.0.0.1:9")
+    result = run(command, PLIANT_REDIS_URL="redis://:secret@127.0.0.1:9", PLIANT_PORT="0")
     assert result.exit_code == Exit.DONE
     assert result.output.count("The job store at redis://127.0.0.1:9 is unavailable (Connection refused).") == 1
     assert "secret" not in result.output

@@ -294,6 +294,17 @@ def test_other_origins_and_hosts_cannot_write(running: Running, headers: dict[st
     assert running.waiting == before
 
 
+def test_a_refused_origin_is_compared_with_the_host(running: Running) -> None:
+    """A proxy that drops the port from the Host header makes the service's own page foreign."""
+    host = running.url.removeprefix("http://")
+    headers = {"Origin": running.url.replace("http://", "https://"), "Host": host.partition(":")[0]}
+    refused = httpx.post(f"{running.url}/v1/jobs", content=b"", headers=headers).json()
+    assert (refused["code"], refused["got"]) == ("cross_site_request", f"https://{host}")
+    assert refused["expected"] == "127.0.0.1"
+    passed = httpx.post(f"{running.url}/v1/jobs", content=b"", headers={**headers, "Host": host}).json()
+    assert passed["code"] != "cross_site_request"
+
+
 def test_an_allowed_origin_passes_the_origin_check(serve: Serve) -> None:
     running = serve(cors_origins=("https://good.example",))
     headers = {"Origin": "https://good.example"}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from itertools import pairwise
+from pathlib import Path
 
 import httpx
 import pytest
@@ -87,6 +89,21 @@ def test_missing_opentelemetry_names_the_extra_to_install(monkeypatch: pytest.Mo
     with pytest.raises(InvalidSetting, match=r"\.\[otel\]"):
         tracing.configure("console", service="test")
     tracing.configure("off", service="test")
+
+
+@pytest.mark.parametrize("command", [["pliant.worker", "work"], ["pliant.worker", "reconcile"], ["pliant.cli", "work"]])
+def test_no_worker_starts_without_opentelemetry(tmp_path: Path, command: list[str]) -> None:
+    """It would fail every job that it takes."""
+    blocked = tmp_path / "opentelemetry"
+    blocked.mkdir()
+    (blocked / "__init__.py").write_text("raise ImportError('not installed')")
+    env = {**os.environ, "PYTHONPATH": str(tmp_path), "PLIANT_TRACING": "otlp", "PLIANT_DATA": str(tmp_path / "data")}
+    env["PLIANT_REDIS_URL"] = "redis://127.0.0.1:9"
+    ended = subprocess.run(
+        [sys.executable, "-m", *command], env=env, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert ended.returncode in (1, 3), ended.stderr
+    assert "PLIANT_TRACING: expected off, or the extra otel" in ended.stderr
 
 
 def test_console_spans_are_printed_even_if_stdout_is_redirected() -> None:

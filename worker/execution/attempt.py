@@ -70,7 +70,9 @@ def run(id: str, attempt_id: str, *, settings: Settings, worker: str) -> None:
             if stored.job.started_at is not None:
                 tracing.past("queued", begin=stored.job.created_at, end=stored.job.started_at)
             status = _conclude(attempt, stored, worker=worker, settings=settings)
-        logger.info("job %s: attempt %d ended: %s", id, stored.job.attempt, status, extra={**about, "outcome": status})
+        why, code = ("", {}) if attempt.code is None else (f" ({attempt.code})", {"code": attempt.code})
+        about |= {"outcome": status, **code}
+        logger.info("job %s: attempt %d ended: %s%s", id, stored.job.attempt, status, why, extra=about)
     finally:
         tracing.finish()
 
@@ -111,6 +113,8 @@ class Attempt:
     """Monotonic time at which the time limit is reached."""
     unwanted: bool = False
     """Whether the job was cancelled, timed out, or belongs to another attempt."""
+    code: str | None = None
+    """Code of the error that the job has failed with."""
     warnings: Sequence[str] = ()
     """Warnings about a film, known before its job is solved; they may explain why it fails."""
     _parent: int = field(default_factory=os.getppid)
@@ -207,6 +211,7 @@ class Attempt:
         kept = deadline.retry(lambda: self.jobs.records.update(self.id, change))
         if kept.prefix is None:
             self.jobs.blobs.delete(self.prefix)
+        self.code = None if kept.job.error is None else kept.job.error.code
         return kept.job.status.value
 
     def store(self, finished: Finished, results: Path) -> None:

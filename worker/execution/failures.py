@@ -35,6 +35,12 @@ def problem_of(error: BaseException, *, memory_limit: int = 0) -> Problem:
             f"A file could not be read or written ({reason}). Free disk space or repair the disk, then retry the job."
         )
         return Problem.of("storage_failed", detail=detail)
+    if isinstance(error, FileNotFoundError):  # of the blob store: those of the system have a number
+        detail = (
+            "A stored file of the job is missing in the blob store of its worker. Check that PLIANT_BLOB_URL names the same one for the "
+            "worker as for the service, then retry the job; if it does, the file was lost: submit the job again."
+        )
+        return Problem.of("storage_failed", detail=detail)
     return Problem.of(
         "internal_error",
         detail=f"The job failed with an unexpected {type(error).__name__}; this is a defect of Pliant. "

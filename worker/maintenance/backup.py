@@ -33,7 +33,7 @@ from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.records import Stored, utc_now
 from pliant.worker.settings import Settings
-from pliant.worker.store.schema import CURRENT
+from pliant.worker.store.schema import CURRENT, migrated
 from pliant.worker.store.snapshot import Snapshot
 
 FORMAT = 1
@@ -219,7 +219,7 @@ def _verified(source: Path, manifest: dict[str, Any]) -> tuple[Path, Path]:
         next(source / name for name in manifest["files"] if name.startswith(start)) for start in ("jobs-", "rest-")
     )
     for line in _lines(records):
-        record = json.loads(line)["record"]
+        record = migrated(json.loads(line)["record"])  # refuses one of a newer version
         for artifact in record["job"]["artifacts"]:
             file = source / "blobs" / f"{record['prefix']}{artifact['name']}"
             if _sha256(file) != artifact["sha256"]:

@@ -87,6 +87,8 @@ class Retention:
         """
         now, cursor = self.jobs.clock(), None
         if not among_all:
+            if self.jobs.settings.retention == 0:
+                return  # a job that expires has ended under an earlier setting
             oldest_kept = now - timedelta(seconds=self.jobs.settings.retention)
             cursor = f"{milliseconds(oldest_kept):014d}:000"  # before the first of those that were created then
         while True:

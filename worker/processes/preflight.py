@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from pliant.worker import tracing
 from pliant.worker.environment import variable_of
 from pliant.worker.errors import InvalidSetting, StoreUnavailable
 from pliant.worker.paths import make_data_directory
@@ -21,9 +22,21 @@ def check_settings(settings: Settings) -> None:
     Raises
     ------
     InvalidSetting
-        The workers do not fit into the memory, or the URL of a store is malformed or names a folder that cannot be made.
+        The workers do not fit into the memory, or what `check_process` finds.
     """
     check_workers(settings)
+    check_process(settings)
+
+
+def check_process(settings: Settings) -> None:
+    """Check the settings that every process needs; no server is called.
+
+    Raises
+    ------
+    InvalidSetting
+        The URL of a store is malformed or names a folder that cannot be made, or the extra for tracing is not installed.
+    """
+    tracing.check(settings.tracing)
     # The clients are imported for given URLs only: they would stay in the memory of this process.
     if settings.redis_url is not None:
         from pliant.worker.store.connection import connect

@@ -47,6 +47,9 @@ SWITCHES = ("allow_http", "allow_invalid_certificates", "http1_only", "http2_onl
 TEXTS = ("proxy_url", "proxy_ca_certificate", "proxy_excludes", "user_agent")
 """Connection options for S3, set by the `AWS_…` variables of the same names."""
 
+LONGEST_MESSAGE = 2000
+"""Characters of a store's message that are logged: it may contain a proxy's page."""
+
 FAULTS_OF_DISKS = tuple(os.strerror(number) for number in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES))
 """The system's sentences for a directory that takes no files; they name no path."""
 
@@ -121,7 +124,7 @@ class Blobs:
         Raises
         ------
         InvalidSetting
-            The text is not a URL, or one of another kind of store.
+            The text is not a URL, or one of another kind of store; or an `AWS_…` variable is invalid.
         """
         if url.startswith("memory:"):
             return cls(MemoryStore())
@@ -132,14 +135,22 @@ class Blobs:
                     raise InvalidSetting("PLIANT_BLOB_URL", expected=expected, got=repr(url))
                 store = from_url(url, mkdir=True, automatic_cleanup=True)
                 return cls(store, directory=Path(unquote(urlsplit(url).path)))
-            options: Any = {**CLIENT, **client_options(os.environ)}
             try:
                 scheme, bucket, *_ = urlsplit(url)
                 if scheme != "s3" or not bucket:
                     raise ValueError(url)
-                return cls(from_url(url, client_options=options, retry_config=RETRIES), remote=True)
             except ValueError:
                 raise InvalidSetting("PLIANT_BLOB_URL", expected=expected, got=repr(url)) from None
+            options: Any = {**CLIENT, **client_options(os.environ)}
+            try:
+                return cls(from_url(url, client_options=options, retry_config=RETRIES), remote=True)
+            except (ValueError, BaseError) as fault:
+                raise InvalidSetting(
+                    "AWS_… variables",
+                    expected=f"values with which {url} can be opened",
+                    got=f"the error {str(fault).splitlines()[0]!r}",
+                    hint="docs/how-to/s3.md lists the variables.",
+                ) from None
 
     def put(self, key: str, file: Path, *, media_type: str = "application/octet-stream") -> int:
         """Store a file atomically and durably; return its size in bytes.
@@ -284,6 +295,11 @@ def client_options(environment: Mapping[str, str]) -> dict[str, object]:
 
     obstore itself reads those for credentials, region and endpoint. `AWS_TIMEOUT` and `AWS_CONNECT_TIMEOUT` have no effect, because
     the time limits here depend on each other.
+
+    Raises
+    ------
+    InvalidSetting
+        The file of `AWS_CA_BUNDLE` cannot be read.
     """
     given: dict[str, object] = {}
     for name in SWITCHES:
@@ -295,7 +311,12 @@ def client_options(environment: Mapping[str, str]) -> dict[str, object]:
             given[name] = text
     certificates = environment.get("AWS_CA_BUNDLE", "").strip()
     if certificates:
-        given["root_certificate"] = Path(certificates).read_text()
+        try:
+            given["root_certificate"] = Path(certificates).read_text()
+        except (OSError, ValueError) as fault:
+            raise InvalidSetting(
+                "AWS_CA_BUNDLE", expected="a PEM file that this user can read", got=str(fault)
+            ) from None
     return given
 
 
@@ -317,13 +338,14 @@ def _linked(source: Path, target: Path) -> bool:
 def answering() -> Iterator[None]:
     """Translate failures of the store to `StoreUnavailable`; a missing file stays `FileNotFoundError`.
 
-    The store's message is only logged, since it contains endpoint, bucket and key.
+    The store's message is only logged, since it contains endpoint, bucket and key. It has several lines: an S3 server's reason is in the
+    second, the reason for which a connection failed in the last.
     """
     try:
         yield
     except FileNotFoundError:
         raise
     except (BaseError, OSError) as error:
-        logger.warning("blob store: %s", str(error).splitlines()[0][:300])
+        logger.warning("blob store: %s", " ".join(str(error).split())[:LONGEST_MESSAGE])
         reason = next((fault for fault in FAULTS_OF_DISKS if fault in str(error)), type(error).__name__)
         raise StoreUnavailable("The blob store", reason=reason) from error

@@ -327,7 +327,7 @@ def test_a_public_service_without_tokens_does_not_start(valkey_url: str, caplog:
     [
         ("REDIS_URL", "http://host", "PLIANT_REDIS_URL: expected a URL redis://"),
         ("BLOB_URL", "/srv/blobs", "PLIANT_BLOB_URL: expected file:///FOLDER"),
-        ("BLOB_URL", "file:///proc/none", "The blob store is unavailable"),
+        ("BLOB_URL", "file:///proc/none", "PLIANT_BLOB_URL: expected a folder that exists or can be made"),
     ],
 )
 def test_a_service_whose_stores_cannot_be_opened_does_not_start(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import subprocess
 import sys
@@ -291,6 +292,29 @@ def test_a_scratch_folder_that_cannot_be_made_fails_the_job_with_its_cause(
     assert job.error is not None
     assert job.error.code == "storage_failed"
     assert "NotADirectoryError" in jobs.log(id)
+
+
+def test_a_worker_with_another_blob_store_names_the_setting(
+    jobs: Jobs,
+    inputs_file: Path,
+    interpretation: Interpretation,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """It failed every job as a defect of Pliant."""
+    caplog.set_level("INFO")
+    elsewhere = dataclasses.replace(jobs, blobs=Blobs.open((tmp_path / "elsewhere").as_uri()))
+    monkeypatch.setattr(Jobs, "open", lambda _: elsewhere)
+    id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+    run(id, jobs.records.get(id).attempt_id, settings=jobs.settings, worker="w")
+    job = jobs.get(id)
+    assert job.error is not None
+    assert (job.error.code, job.error.retryable) == ("storage_failed", True)
+    assert "Check that PLIANT_BLOB_URL names the same one for the worker" in job.error.detail
+    last = caplog.records[-1]
+    assert last.getMessage() == f"job {id}: attempt 1 ended: failed (storage_failed)"
+    assert (last.__dict__["outcome"], last.__dict__["code"]) == ("failed", "storage_failed")
 
 
 def test_a_full_disk_is_named_and_freed_before_the_failure_is_recorded(

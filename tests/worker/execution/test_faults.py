@@ -261,7 +261,7 @@ def test_a_job_missing_from_the_queue_is_completed(house: House) -> None:
 
 
 @pytest.mark.slow
-def test_lost_inputs_are_an_internal_error_with_a_traceback_in_the_log(house: House) -> None:
+def test_lost_inputs_are_a_storage_failure_with_a_traceback_in_the_log(house: House) -> None:
     first, second = house.submit(long=True), house.submit(long=True)
     house.solving(first)
     house.solving(second)
@@ -271,7 +271,8 @@ def test_lost_inputs_are_an_internal_error_with_a_traceback_in_the_log(house: Ho
     house.jobs.cancel(second)
     job = house.final(id)
     assert job.error is not None
-    assert (job.error.code, job.error.status) == ("internal_error", 500)
+    assert (job.error.code, job.error.status) == ("storage_failed", 503)
+    assert "A stored file of the job is missing" in job.error.detail
     assert "Traceback" not in job.error.detail
     assert "Traceback" in house.jobs.log(id)
     house.final(first)
@@ -345,6 +346,18 @@ def test_a_data_directory_that_cannot_be_made_is_named(settings: Settings, tmp_p
         assert ended.returncode in (1, 2)
         assert ended.stderr.startswith("PLIANT_DATA: expected a folder that this user can create and write, got '")
         assert "(Not a directory). Make the folder for the user that runs Pliant" in ended.stderr
+
+
+@pytest.mark.slow
+def test_a_blob_folder_that_cannot_be_made_is_named(settings: Settings, tmp_path: Path) -> None:
+    """By each process that may be started alone, as by `pliant up`; they said that the store is unavailable, and to try again."""
+    (tmp_path / "file").touch()
+    url = (tmp_path / "file" / "blobs").as_uri()
+    env = {**os.environ, **settings.to_environment(), "PLIANT_BLOB_URL": url}
+    for command in (["pliant.worker", "work"], ["pliant.worker", "reconcile"], ["pliant.service"]):
+        ended = subprocess.run([sys.executable, "-m", *command], capture_output=True, text=True, check=False, env=env)
+        assert ended.returncode in (1, 2)
+        assert f"PLIANT_BLOB_URL: expected a folder that exists or can be made, got '{url}'" in ended.stderr
 
 
 @pytest.mark.slow

@@ -226,6 +226,7 @@ def test_calls_are_retried_until_the_store_answers(jobs: Jobs, running: Callable
         (MemoryError("Unable to allocate"), "out_of_memory", 507, True),
         (OSError(12, "Cannot allocate memory"), "out_of_memory", 507, True),
         (OSError(28, "No space left on device"), "storage_failed", 503, True),
+        (FileNotFoundError("Object at location secret not found"), "storage_failed", 503, True),
         (StoreUnavailable("The blob store", reason="gone"), "store_unavailable", 503, True),
         (ZeroDivisionError("secret detail"), "internal_error", 500, False),
         (OSError("no number"), "internal_error", 500, False),

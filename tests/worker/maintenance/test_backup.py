@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import secrets
 import shutil
@@ -273,7 +274,7 @@ def test_an_interrupted_first_backup_is_continued(
 
 
 @pytest.mark.parametrize(
-    "what", ["jobs-*", "blobs/**/inputs.npz", "blobs/**/shapes.npz", "flipped", "format", "schema"]
+    "what", ["jobs-*", "blobs/**/inputs.npz", "blobs/**/shapes.npz", "flipped", "format", "schema", "record"]
 )
 def test_a_damaged_backup_is_refused_before_anything_is_written(backup: Path, empty: Settings, what: str) -> None:
     error: type[Exception] = BadBackup
@@ -288,6 +289,14 @@ def test_a_damaged_backup_is_refused_before_anything_is_written(backup: Path, em
     elif what == "schema":
         error = NewerData
         (backup / "manifest.json").write_text(json.dumps({**manifest, "schema": 99}))
+    elif what == "record":  # of a newer process that ran beside the one that made the backup
+        error = NewerData
+        file = next(backup.glob("jobs-*"))
+        *others, last = map(json.loads, file.read_text().splitlines())
+        last["record"]["schema"] = 99
+        file.write_text("".join(json.dumps(line) + "\n" for line in [*others, last]))
+        manifest["files"][file.name] = hashlib.sha256(file.read_bytes()).hexdigest()
+        (backup / "manifest.json").write_text(json.dumps(manifest))
     else:
         file = next(backup.glob(what))
         file.write_bytes(file.read_bytes()[:-1])

@@ -110,10 +110,7 @@ def test_only_expired_jobs_are_removed(world: World, submit: Callable[[World], s
     assert all(early not in key for key, _ in world.jobs.blobs.list("jobs/"))
 
 
-def test_records_that_cannot_have_expired_are_read_once_an_hour(
-    world: World, submit: Callable[[World], str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Reading a hundred thousand records takes longer than the pause between two checks."""
+def note_what_retention_reads(world: World, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     read: list[str] = []
     page = type(world.jobs).page
 
@@ -122,12 +119,36 @@ def test_records_that_cannot_have_expired_are_read_once_an_hour(
         read.extend(job.id for job in found.jobs if "cursor" in given)  # not those that others read
         return found
 
+    monkeypatch.setattr(type(world.jobs), "page", noted)
+    return read
+
+
+def test_records_that_are_kept_for_ever_are_read_once_an_hour(
+    world: World, submit: Callable[[World], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world.jobs = dataclasses.replace(world.jobs, settings=dataclasses.replace(world.jobs.settings, retention=0))
+    world.reconciler.jobs = world.reconciler.retention.jobs = world.jobs
+    read = note_what_retention_reads(world, monkeypatch)
+    kept = submit(world)
+    world.jobs.cancel(kept)
+    world.pass_seconds(100)
+    assert read == []
+    world.monotonic += 3600
+    world.now += timedelta(hours=1)
+    world.pass_seconds(1)
+    assert read == [kept]
+
+
+def test_records_that_cannot_have_expired_are_read_once_an_hour(
+    world: World, submit: Callable[[World], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reading a hundred thousand records takes longer than the pause between two checks."""
+    read = note_what_retention_reads(world, monkeypatch)
     kept = submit(world)
     world.jobs.cancel(kept)
     stored = world.jobs.records.get(kept)
     late = stored.job.model_copy(update={"expires_at": world.now + timedelta(days=9)})  # of a longer period
     world.jobs.records.replace(stored, stored.model_copy(update={"job": late, "version": stored.version + 1}))
-    monkeypatch.setattr(type(world.jobs), "page", noted)
     world.pass_seconds(35)
     assert read == []  # it is younger than the retention of 60 s
     world.pass_seconds(60)

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -208,6 +209,46 @@ def test_a_store_that_never_replies_is_unavailable(monkeypatch: pytest.MonkeyPat
             assert "127.0.0.1" not in str(problem)
 
 
+REFUSAL = b"""<?xml version="1.0" encoding="UTF-8"?>
+<Error><Code>AuthorizationHeaderMalformed</Code><Message>the region 'us-east-1' is wrong; expecting 'eu-central-1'</Message></Error>"""
+
+
+class RefusesEverything(BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        self.send_response(400)
+        self.send_header("content-length", str(len(REFUSAL)))
+        self.end_headers()
+        self.wfile.write(REFUSAL)
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+def test_the_log_has_the_reason_of_an_s3_server_and_of_a_failed_connection(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name, value in {
+        "REGION": "us-east-1",
+        "ACCESS_KEY_ID": "k",
+        "SECRET_ACCESS_KEY": "s",
+        "ALLOW_HTTP": "1",
+    }.items():
+        monkeypatch.setenv(f"AWS_{name}", value)
+    with ThreadingHTTPServer(("127.0.0.1", 0), RefusesEverything) as server:
+        threading.Thread(target=server.serve_forever).start()
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
+        with pytest.raises(StoreUnavailable):
+            Blobs.open("s3://bucket/prefix").check()
+        server.shutdown()
+    with pytest.raises(StoreUnavailable):
+        Blobs.open("s3://bucket/prefix").check()
+    told = (record.getMessage() for record in caplog.records)
+    refused, unreachable = (line for line in told if f":{server.server_port}/" in line)  # not of calls of earlier tests
+    assert "expecting 'eu-central-1'" in refused
+    assert "Connection refused" in unreachable
+    assert "\n" not in refused + unreachable
+
+
 def test_every_store_variable_is_documented() -> None:
     page = (Path(__file__).parents[3] / "docs" / "how-to" / "s3.md").read_text()
     credentials = ("access_key_id", "secret_access_key", "session_token", "region", "endpoint_url", "ca_bundle")
@@ -245,6 +286,30 @@ def test_connection_variables_are_passed_to_the_store(monkeypatch: pytest.Monkey
     monkeypatch.setattr("pliant.worker.store.blobs.from_url", opened)
     Blobs.open("s3://bucket/prefix")
     assert given == {**CLIENT, **client_options(variables)}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        (
+            "AWS_CA_BUNDLE",
+            "/no/such/file",
+            "AWS_CA_BUNDLE: expected a PEM file that this user can read, got .*No such file",
+        ),
+        ("AWS_CA_BUNDLE", __file__, "AWS_… variables: .*No certificates found"),
+        (
+            "AWS_SKIP_SIGNATURE",
+            "maybe",
+            "AWS_… variables: expected values with which s3://bucket/prefix can be opened, .*boolean",
+        ),
+    ],
+)
+def test_an_invalid_store_variable_is_named_in_place_of_the_url(
+    name: str, value: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(name, value)
+    with pytest.raises(InvalidSetting, match=words):
+        Blobs.open("s3://bucket/prefix")
 
 
 @pytest.mark.parametrize(

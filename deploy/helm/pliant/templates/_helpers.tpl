@@ -10,7 +10,7 @@ app.kubernetes.io/managed-by: {{ .Release.Service }}
 {{- end }}
 
 {{- define "pliant.redisSecret" -}}
-{{- if .Values.valkey.enabled }}{{ .Release.Name }}-redis{{ else }}{{ required "redis.existingSecret names the Secret with the URL, where valkey.enabled is false" .Values.redis.existingSecret }}{{ end }}
+{{- if .Values.redis.existingSecret }}{{ .Values.redis.existingSecret }}{{ else if .Values.valkey.enabled }}{{ .Release.Name }}-redis{{ else }}{{ fail "redis.existingSecret names the Secret with the URL, where valkey.enabled is false" }}{{ end }}
 {{- end }}
 
 {{- define "pliant.tokenSecret" -}}
@@ -56,9 +56,11 @@ capabilities: {drop: [ALL]}
 {{- else }}
   value: file:///data/shared/blobs
 {{- end }}
-- name: PLIANT_LOG_FORMAT
-  value: json
-{{- range $name, $value := .Values.settings }}
+{{- $own := list "DATA" "REDIS_URL" "BLOB_URL" "HOST" "PORT" "AUTH" "PARSERS" "READ_MEMORY" "ALLOWED_HOSTS" "THREADS" "MEMORY_LIMIT" "STOP_GRACE" }}
+{{- range $name, $value := merge (dict) .Values.settings (dict "PLIANT_LOG_FORMAT" "json") }}
+{{- if has (trimPrefix "PLIANT_" $name) $own }}
+{{- fail (printf "settings.%s: the chart sets this variable itself; values.yaml names the value for it, if there is one" $name) }}
+{{- end }}
 - name: {{ $name }}
   value: {{ $value | quote }}
 {{- end }}
