@@ -2,7 +2,7 @@
 
 The inconsistency I is the relative change of the edge lengths from frame to frame. As a function of the focal length, it has its minimum at
 the true one if perspective is strong enough; otherwise it is flat, large or monotone. Each focal length starts from the depths of a
-neighbouring one, the first from the conic program. Around a minimum that may be accepted, lengths are those along the surface.
+neighbouring one, the first from the conic program. Lengths are those along the surface (`arc_lengths`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.anchors import Anchors
-from pliant.solver.isometry.arc_lengths import arc_chord_ratios
+from pliant.solver.isometry.arc_lengths import ROUNDS, arc_chord_ratios
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import Isometry, refine
 from pliant.solver.isometry.restarts import refine_with_restarts
@@ -99,30 +99,39 @@ class Tried:
 def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) -> list[Tried]:
     """Return the isometries tried: downhill from the first focal length by `FOCAL_STEP`, at most one step beyond `FOCAL_RANGE`.
 
-    Unless `given`, the bracket of the minimum is then searched, if a minimum there could be accepted.
+    Distances between the ends of edges vary where the surface bends. They make focal lengths that are too long more consistent, since the
+    surface bends less there, so lengths along the surface are needed before longer ones are tried. Unless `given`, the bracket of the
+    minimum is then searched, if a minimum there could be accepted.
     """
     first = tried_at(search, focal, None)
     if first is None:
         return []
-    tried = [first]
-    low, high = (
-        min(FOCAL_RANGE[0] * diagonal, focal),
-        max(FOCAL_RANGE[1] * diagonal, focal),
-    )  # a given one may be outside
-    while not search.should_stop():
-        least = least_of(tried)
-        if not low <= least.focal <= high:
-            break
-        further = _beside(search, tried, least)
-        if not further:
-            break
-        tried += further
-    if not given and _may_be_accepted(tried):
+    # A given focal length may be outside the range.
+    ends = min(FOCAL_RANGE[0] * diagonal, focal), max(FOCAL_RANGE[1] * diagonal, focal)
+    tried = _downhill(search, [first], ends, sides=(-1,))
+    for _ in range(ROUNDS):
         search, tried = _along_surface(search, tried)
+        tried = _downhill(search, tried, ends)
+    if not given and _may_be_accepted(tried):
         tried += _golden(search, least_of(tried))
         tried += _beside(
             search, tried, least_of(tried)
         )  # the new minimum may lack a neighbour at the distance of a step
+    return tried
+
+
+def _downhill(
+    search: FocalSearch, tried: list[Tried], ends: tuple[float, float], *, sides: tuple[int, ...] = (1, -1)
+) -> list[Tried]:
+    """Return the isometries tried, continued downhill from the least I towards longer (1) and shorter (−1) focal lengths."""
+    while not search.should_stop():
+        least = least_of(tried)
+        if not ends[0] <= least.focal <= ends[1]:
+            break
+        further = _beside(search, tried, least, sides)
+        if not further:
+            break
+        tried = [*tried, *further]
     return tried
 
 
@@ -153,10 +162,10 @@ def least_of(tried: list[Tried]) -> Tried:
     return min(tried, key=lambda each: each.found.inconsistency)
 
 
-def _beside(search: FocalSearch, tried: list[Tried], least: Tried) -> list[Tried]:
+def _beside(search: FocalSearch, tried: list[Tried], least: Tried, sides: tuple[int, ...] = (1, -1)) -> list[Tried]:
     """Return the isometries one step on either side of the minimum, unless that side has been tried at this distance or farther."""
     missing = [
-        side for side in (1, -1)
+        side for side in sides
         if not any(side * np.log(t.focal / least.focal) >= 0.9 * np.log(FOCAL_STEP) for t in tried)
     ]  # fmt: skip
     found = [tried_at(search, least.focal * FOCAL_STEP**side, least) for side in missing]

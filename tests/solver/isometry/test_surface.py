@@ -144,6 +144,46 @@ def test_no_minimum_is_refined_that_would_not_be_accepted(monkeypatch: pytest.Mo
     assert not verdict.clear
 
 
+@pytest.mark.parametrize("longer", [True, False])
+def test_longer_focal_lengths_are_tried_with_lengths_along_the_surface(
+    monkeypatch: pytest.MonkeyPatch, longer: bool
+) -> None:
+    """Distances make long focal lengths seem consistent, and are compared only with shorter ones."""
+    true, measured = (800.0 if longer else 500.0), [False]
+    focals = with_inconsistencies(
+        monkeypatch,
+        lambda focal: 0.002 + 0.02 * float(np.log(focal / true)) ** 2 if measured[0] else 20.0 / max(focal, true - 200),
+    )
+    tried_with_distances: list[float] = []
+
+    def along_surface(search: FocalSearch, tried: list[Tried]) -> tuple[FocalSearch, list[Tried]]:
+        if not measured[0]:
+            tried_with_distances.extend(focals)
+        measured[0] = True
+        return search, [found for each in tried if (found := focal_sweep.tried_at(search, each.focal, None))]
+
+    monkeypatch.setattr(focal_sweep, "_along_surface", along_surface)
+    tried = focal_sweep.sweep(SEARCH, 640.0, DIAGONAL, given=False)
+    assert max(tried_with_distances) == 640.0
+    assert focal_sweep.least_of(tried).focal == pytest.approx(true, rel=0.05)
+
+
+@pytest.mark.parametrize(("distance", "focal"), [(4.0, None), (2.0, None), (2.0, 350.0)])
+@pytest.mark.slow
+def test_a_flag_that_bends_strongly_is_recognised(distance: float, focal: float | None) -> None:
+    film = gallery.flag(30, 150, degrees=60)
+    shapes = film.shapes - film.shapes.mean(axis=(0, 1))
+    shapes = shapes / np.abs(shapes - shapes.mean(axis=1, keepdims=True)).max()
+    seen = shapes @ (np.diag([1.0, -1.0, -1.0]) @ film.rotations).transpose(0, 2, 1) + [0.0, 0.0, distance]
+    images = 175 * distance * seen[..., :2] / seen[..., 2:] + [319.5, 239.5]
+    noisy = images + 0.2 * np.random.default_rng(1).normal(size=images.shape)
+    found = isometric_surface(Tracks.from_arrays(noisy), focal=focal, image_size=(640.0, 480.0))
+    assert found.surface is not None, found.reason
+    assert not found.weak
+    assert found.surface.focal == pytest.approx(175 * distance, rel=0.15)
+    assert one_scale_error(found.surface.points, seen) < 0.08
+
+
 def test_lengths_that_change_at_every_focal_length_are_not_those_of_a_sheet(monkeypatch: pytest.MonkeyPatch) -> None:
     with_inconsistencies(monkeypatch, lambda focal: 0.05 + 0.02 * float(np.log(focal / 500)) ** 2)
     tried = focal_sweep.sweep(SEARCH, 500.0, DIAGONAL, given=True)
