@@ -20,10 +20,12 @@ from pliant.solver.pulse import ShouldStop
 from pliant.solver.records import Floats
 
 MAX_INCONSISTENCY = 0.012
-"""Maximum I of an isometric surface. Measured: paper .002 and, with 1 px of noise, .003; a comic page .005; faces, bodies .035 to .07."""
+"""Maximum I of an isometric surface. Measured: paper .002 and, with 1 px of noise, .003; a comic page .005; flags that bend
+strongly .008 to .0113; faces, bodies .035 to .07."""
 
 CLEAR = 1.25
-"""Minimum ratio of I at the neighbouring focal lengths to the minimum. Measured: paper and page 1.8 to 2.9; faces at most 1.1."""
+"""Minimum ratio of I at the neighbouring focal lengths to the minimum. Measured: paper and page 1.8 to 2.9, flags 1.26 to
+1.96; faces at most 1.1."""
 
 RISE = 0.002
 """Minimum increase of I at the neighbouring focal lengths. Measured: paper and page .003 to .006; a shallow face seen without perspective,
