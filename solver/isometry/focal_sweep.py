@@ -2,7 +2,8 @@
 
 The inconsistency I is the relative change of the edge lengths from frame to frame. As a function of the focal length, it has its minimum at
 the true one if perspective is strong enough; otherwise it is flat, large or monotone. Each focal length starts from the depths of a
-neighbouring one, the first from the conic program. Lengths are those along the surface (`arc_lengths`).
+neighbouring one, the first from the conic program. Lengths are those along the surface (`arc_lengths`). Surfaces that are stretched along
+the viewing rays are left out.
 """
 
 from __future__ import annotations
@@ -39,9 +40,14 @@ DIP = 0.8
 """Minimum ratio of I to its running maximum with growing distance from the minimum: several minima are no evidence."""
 
 MAX_DEPTH_RATIO = 30.0
-"""Maximum ratio of the depths of the farthest and of the nearest point in a frame. Depths that differ by more keep any lengths constant,
-because they dominate them: without perspective, I has false minima there, with ratios of 60 to 600. A limit of 10 excludes neighbours of
-the true focal length of paper 1.5 half-sizes away."""
+"""Maximum ratio of the depths of the farthest and of the nearest point in a frame. Points near the camera keep any lengths constant with
+few others. A limit of 10 excludes neighbours of the true focal length of paper 1.5 half-sizes away."""
+
+MAX_DEPTH_SHARE = 0.5
+"""Maximum share of depth differences in the squared edge lengths of a frame: that of a plane seen from its edge, with edges in all
+directions. Depths that differ by more keep any lengths constant, because they dominate them: I has false minima there. Measured, in the
+frame with the least share: paper and flags .02 to .15, paper seen from its edge at half to twice the true focal length up to .49; faces,
+and paper without perspective, in false minima .66 to .97."""
 
 FOCAL_STEP = 1.5
 """Ratio of neighbouring focal lengths."""
@@ -75,6 +81,21 @@ class FocalSearch:
     arc_ratios: Floats | None = None
     """`SurfaceGraph.arc_ratios` of `frames`, the same for all focal lengths; None if unknown."""
 
+    deepest: tuple[float, Floats] | None = None
+    """Depths of the conic program, shape `(F, A)`, and the focal length they were found at; None before it is solved."""
+
+    def begun(self, focal: float) -> FocalSearch | None:
+        """Return the search with the depths of the conic program at a focal length; None if the program has no solution."""
+        depths = maximum_depth(self.solved(focal), should_stop=self.should_stop)
+        return None if depths is None else replace(self, deepest=(focal, depths))
+
+    def start(self, focal: float) -> Floats | None:
+        """Return the depths of the conic program for another focal length, shape `(F, A)`; None before it is solved."""
+        if self.deepest is None:
+            return None
+        origin, depths = self.deepest
+        return _carried(depths, self.solved(focal).seen, focal / origin)
+
     def solved(self, focal: float) -> SurfaceGraph:
         """Return the rays and edges of `frames` at a focal length."""
         return replace(self.graph(focal, self.frames), arc_ratios=self.arc_ratios)
@@ -101,25 +122,41 @@ class Tried:
 def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) -> list[Tried]:
     """Return the isometries tried: downhill from the first focal length by `FOCAL_STEP`, at most one step beyond `FOCAL_RANGE`.
 
+    If the surface is stretched at the first focal length, which may be far too long, the search starts with the next shorter ones.
+
     Distances between the ends of edges vary where the surface bends. They make focal lengths that are too long more consistent, since the
     surface bends less there, so lengths along the surface are needed before longer ones are tried. Unless `given`, the bracket of the
     minimum is then searched, if a minimum there could be accepted.
     """
-    first = tried_at(search, focal, None)
-    if first is None:
-        return []
     # A given focal length may be outside the range.
     ends = min(FOCAL_RANGE[0] * diagonal, focal), max(FOCAL_RANGE[1] * diagonal, focal)
+    begun = search.begun(focal)
+    first = None if begun is None else _first(begun, focal, focal if given else ends[0])
+    if begun is None or first is None:
+        return []
+    search = begun
     tried = _downhill(search, [first], ends, sides=(-1,))
     for _ in range(ROUNDS):
-        search, tried = _along_surface(search, tried)
-        tried = _downhill(search, tried, ends)
+        search, along = _along_surface(search, tried)
+        if not along:
+            break
+        tried = _downhill(search, along, ends)
     if not given and _may_be_accepted(tried):
         tried += _golden(search, least_of(tried))
         tried += _beside(
             search, tried, least_of(tried)
         )  # the new minimum may lack a neighbour at the distance of a step
     return tried
+
+
+def _first(search: FocalSearch, focal: float, shortest: float) -> Tried | None:
+    """Return the isometry at a focal length, or at the longest of the shorter ones where it is not stretched, if there is one."""
+    first = found = tried_at(search, focal, None)
+    while found is not None and _stretched(found.graph, found.found):
+        if found.focal <= shortest or search.should_stop():
+            return first
+        found = tried_at(search, found.focal / FOCAL_STEP, None)
+    return found
 
 
 def _downhill(
@@ -138,17 +175,18 @@ def _downhill(
 
 
 def _along_surface(search: FocalSearch, tried: list[Tried]) -> tuple[FocalSearch, list[Tried]]:
-    """Return the search and the isometries tried, with lengths along the surface that has the least I.
+    """Return the search and the isometries tried, with lengths along the surface that has the least I, without stretched surfaces.
 
-    All focal lengths share them: their own would make a surface that is stretched along the viewing rays consistent.
+    All focal lengths share these lengths: their own would make a surface that is stretched along the viewing rays consistent.
     """
     least = least_of(tried)
     search = replace(search, arc_ratios=arc_chord_ratios(least.graph, least.found))
     graphs = [search.solved(each.focal) for each in tried]
-    return search, [
+    refined = [
         Tried(each.focal, graph, refine(graph, each.found.depths, should_stop=search.should_stop))
         for each, graph in zip(tried, graphs, strict=True)
     ]
+    return search, [each for each in refined if not _stretched(each.graph, each.found)]
 
 
 def _may_be_accepted(tried: list[Tried]) -> bool:
@@ -211,26 +249,33 @@ def _golden(search: FocalSearch, middle: Tried) -> list[Tried]:
 
 
 def tried_at(search: FocalSearch, focal: float, near: Tried | None) -> Tried | None:
-    """Return the isometry at a focal length, started from the depths at `near` or, if that is None, from the conic program.
+    """Return the isometry at a focal length, started from the depths at `near`.
 
-    A surface that is stretched along the viewing rays starts again from the conic program. None if the program has no solution, or if the
-    surface is stretched with this start, too.
+    If these lead to a surface that is stretched along the viewing rays, it starts again from `search.deepest`. None if this one is
+    stretched, too. Without `near`, the search starts here, and a stretched surface is returned.
     """
     graph = search.solved(focal)
-    carried = None if near is None else _carried(near.found.depths, graph.seen, focal / near.focal)
-    found = None if carried is None else refine_with_restarts(graph, carried, should_stop=search.should_stop)
-    if found is None or _stretched(graph, found):
-        depths = maximum_depth(graph, should_stop=search.should_stop)
-        if depths is None:
-            return None
-        found = refine_with_restarts(graph, depths, should_stop=search.should_stop)
-    return None if near is not None and _stretched(graph, found) else Tried(focal, graph, found)
+    beside = None if near is None else _carried(near.found.depths, graph.seen, focal / near.focal)
+    for depths in (beside, search.start(focal)):
+        if depths is not None:
+            found = refine_with_restarts(graph, depths, should_stop=search.should_stop)
+            if near is None or not _stretched(graph, found):
+                return Tried(focal, graph, found)
+    return None
 
 
 def _stretched(graph: SurfaceGraph, found: Isometry) -> bool:
-    """Return whether the surface is stretched along the viewing rays (`MAX_DEPTH_RATIO`)."""
+    """Return whether some points are too near the camera, or all frames are stretched along the viewing rays more than a plane can be."""
     nearest, farthest = np.where(graph.seen, found.depths, np.inf).min(axis=1), found.depths.max(axis=1)
-    return bool((farthest > MAX_DEPTH_RATIO * nearest).any())
+    frame, edge = graph.pairs
+    first, second = graph.edges[edge].T
+    points = found.depths[..., None] * graph.rays
+    apart = points[frame, first] - points[frame, second]
+    ray = graph.rays[frame, first] + graph.rays[frame, second]
+    depth = np.square((apart * ray).sum(axis=1)) / np.square(ray).sum(axis=1)
+    in_depth, whole = (np.bincount(frame, each) for each in (depth, np.square(apart).sum(axis=1)))
+    deep = (in_depth > MAX_DEPTH_SHARE * whole)[whole > 0]
+    return bool((farthest > MAX_DEPTH_RATIO * nearest).any() or deep.all())
 
 
 def _carried(depths: Floats, seen: NDArray[np.bool_], ratio: float) -> Floats:

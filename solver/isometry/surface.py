@@ -9,7 +9,7 @@ lengths, and if halves of the frames lead to the same edge lengths (`confirmatio
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,16 @@ from pliant.solver.isometry.anchors import choose_anchors, connected, nearest_ne
 from pliant.solver.isometry.arc_lengths import refine_along_surface
 from pliant.solver.isometry.confirmation import DECISIVE, DISAGREEMENT, deformation, disagreement
 from pliant.solver.isometry.extension import MIN_ANCHORS, Extended, complete_anchors, extend, flatten
-from pliant.solver.isometry.focal_sweep import CLEAR, FocalSearch, Judgement, Tried, judged, least_of, sweep
+from pliant.solver.isometry.focal_sweep import (
+    CLEAR,
+    FOCAL_STEP,
+    FocalSearch,
+    Judgement,
+    Tried,
+    judged,
+    least_of,
+    sweep,
+)
 from pliant.solver.isometry.homographies import off_homography
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import refine
@@ -42,12 +51,15 @@ page .042 and .052, made-up paper that the camera passes by 50° to 180° .02 to
 with a limit of .2, none of those in `benchmarks.accuracy.kinds`, and of the recorded sequences seen from three half-sizes away, is taken as
 isometric."""
 
-HOPELESS = 0.03
-"""I of the subset `SMALL_PART` at the first focal length above which `auto` rejects isometry. Measured: paper and page at half to four
-times the true focal length .003 to .022; faces .037 to .068."""
+HOPELESS = 0.025
+"""I of the subset `SMALL_PART` at the best of `GLANCES` focal lengths above which `auto` rejects isometry. Measured: paper, a page and
+flags .003 to .018, .022 at half the true focal length; most bodies .021 to .06."""
 
 SMALL_PART = (30, 12, 10)
 """Numbers of anchors, frames and neighbours in the subset of the first test."""
+
+GLANCES = 3
+"""Number of focal lengths in the first test, `FOCAL_STEP` apart: a camera near a sheet may have half the usual focal length."""
 
 TYPICAL_FOCAL = 0.8
 """First focal length tried, in image diagonals: a diagonal angle of view of about 64°."""
@@ -281,15 +293,23 @@ def _prepared(points: Floats, confidence: Floats, centre: Floats, should_stop: S
 
 
 def _glance(search: FocalSearch, focal: float) -> float:
-    """Return I of the subset `SMALL_PART` at one focal length; infinite if there is no surface."""
+    """Return the least I of the subset `SMALL_PART` at a focal length and shorter ones; infinite if there is no surface."""
     some, frames, neighbours = SMALL_PART
     seen = search.seen[:, :some]
     edges = nearest_neighbours(search.anchors.points[:, :some], seen, neighbours=neighbours)
-    used = search.frames[:frames]
-    whole = search.graph(focal, used)
-    graph = SurfaceGraph(whole.rays[:, :some], whole.confidence[:, :some] * connected(seen, edges)[used], edges)
-    depths = maximum_depth(graph, should_stop=search.should_stop)
-    return refine(graph, depths, iterations=10).inconsistency if depths is not None else float("inf")
+    anchors = search.anchors
+    part = replace(
+        search,
+        anchors=replace(anchors, points=anchors.points[:, :some], confidence=anchors.confidence[:, :some]),
+        edges=edges,
+        seen=connected(seen, edges),
+        frames=search.frames[:frames],
+    )
+    begun = part.begun(focal)
+    if begun is None:
+        return float("inf")
+    tried = [(begun.solved(each), begun.start(each)) for each in focal / FOCAL_STEP ** np.arange(GLANCES)]
+    return min(refine(graph, depths, iterations=10).inconsistency for graph, depths in tried if depths is not None)
 
 
 def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried) -> IsometricSurface | None:

@@ -26,7 +26,9 @@ from rolled_sheets import CENTRE, FOCAL, SIZE, one_scale_error, rolled
 def search_of(tracks: Tracks) -> FocalSearch:
     found = surface._prepared(tracks.points, tracks.visible > 0, np.array(CENTRE), never)
     assert found is not None
-    return found
+    begun = found.begun(FOCAL)
+    assert begun is not None
+    return begun
 
 
 @pytest.mark.slow
@@ -118,25 +120,28 @@ def test_weak_evidence_decides_only_against_a_free_surface_that_differs_and_is_n
 
 def test_a_stretched_surface_starts_again_from_the_conic_program(monkeypatch: pytest.MonkeyPatch) -> None:
     search = search_of(rolled(frames=5, side=6).tracks)
-    alone = tried_at(search, FOCAL, None)
-    assert alone is not None
+    conic = maximum_depth(search.solved(FOCAL))
+    assert conic is not None
     beside = tried_at(search, 1.2 * FOCAL, None)
     assert beside is not None
     starts: list[NDArray[np.float64]] = []
 
     def stretched_at_first(graph: SurfaceGraph, depths: NDArray[np.float64], **options: object) -> Isometry:
         starts.append(depths)
-        exponent = 40 if len(starts) == 1 else 1
-        return Isometry(depths**exponent / depths.max() ** (exponent - 1), alone.found.lengths, 0.0)
+        return Isometry(stretched(depths) if len(starts) == 1 else depths, beside.found.lengths, 0.0)
 
     monkeypatch.setattr(focal_sweep, "refine_with_restarts", stretched_at_first)
     found = tried_at(search, FOCAL, beside)
     assert found is not None
     first, again = starts
-    conic = maximum_depth(search.solved(FOCAL))
-    np.testing.assert_array_equal(again, conic)
-    np.testing.assert_array_equal(found.found.depths, conic)
+    np.testing.assert_allclose(again, conic, rtol=1e-12)
+    np.testing.assert_array_equal(found.found.depths, again)
     assert not np.array_equal(first, again)
+
+
+def stretched(depths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return depths in the same order whose differences are far larger than distances across the viewing rays."""
+    return depths**40 / depths.max() ** 39
 
 
 def test_surfaces_stretched_along_the_rays_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,8 +149,29 @@ def test_surfaces_stretched_along_the_rays_do_not_count(monkeypatch: pytest.Monk
     first = tried_at(search, FOCAL, None)
     assert first is not None
     assert tried_at(search, 1.1 * FOCAL, first) is not None
-    monkeypatch.setattr("pliant.solver.isometry.focal_sweep.MAX_DEPTH_RATIO", 1.01)
+
+    def always(graph: SurfaceGraph, depths: NDArray[np.float64], **options: object) -> Isometry:
+        return Isometry(stretched(depths), first.found.lengths, 0.0)
+
+    monkeypatch.setattr(focal_sweep, "refine_with_restarts", always)
     assert tried_at(search, 1.1 * FOCAL, first) is None
+    monkeypatch.setattr(focal_sweep, "refine", always)
+    assert focal_sweep._along_surface(search, [first])[1] == []
+
+
+@pytest.mark.parametrize(("tilt", "seen_from_edge"), [(0.0, False), (60.0, False), (89.9, False), (0.0, True)])
+def test_no_plane_is_stretched_however_it_is_tilted(tilt: float, seen_from_edge: bool) -> None:
+    """Edges in all directions in a plane that is seen from its edge have half of their squared lengths in depth."""
+    angles = 2 * np.pi * np.arange(12) / 12
+    wheel = np.concatenate([np.zeros((1, 2)), np.stack([np.cos(angles), np.sin(angles)], axis=1)])
+    turn = np.radians(tilt)
+    points = np.stack([wheel[:, 0], np.cos(turn) * wheel[:, 1], 1000 + np.sin(turn) * wheel[:, 1]], axis=1)
+    if seen_from_edge:  # and drawn out by a tenth along the viewing rays
+        points = np.stack([wheel[:, 0], 0 * wheel[:, 1], 1000 + 1.1 * wheel[:, 1]], axis=1)
+    edges = np.array([(0, rim) for rim in range(1, 13)])
+    graph = SurfaceGraph((points / points[:, 2:])[None], np.ones((1, 13)), edges)
+    found = Isometry(points[None, :, 2], np.ones(12), 0.0)
+    assert focal_sweep._stretched(graph, found) is seen_from_edge
 
 
 def test_fewer_than_two_frames_per_half_confirm_nothing() -> None:

@@ -93,6 +93,7 @@ def with_inconsistencies(monkeypatch: pytest.MonkeyPatch, of_focal: Callable[[fl
         return Tried(focal, SEARCH.graph(focal), Isometry(np.ones((2, 3)), np.ones(3), of_focal(focal)))
 
     monkeypatch.setattr(focal_sweep, "tried_at", tried_at)
+    monkeypatch.setattr(FocalSearch, "begun", lambda search, focal: search)
     monkeypatch.setattr(focal_sweep, "_along_surface", lambda search, tried: (search, tried))
     return focals
 
@@ -113,6 +114,25 @@ def test_the_focal_sweep_finds_a_minimum_and_tries_its_neighbours(monkeypatch: p
     least = focal_sweep.least_of(tried)
     assert least.focal == pytest.approx(true * DIAGONAL, rel=0.05)
     assert focal_sweep.judged(tried, least).clear
+
+
+def test_the_focal_sweep_starts_where_the_surface_is_not_stretched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stretched surfaces have a small I at focal lengths that are far too long."""
+
+    def inconsistency(focal: float) -> float:
+        return 0.001 if focal > 800 else 0.002 + 0.02 * float(np.log(focal / 400)) ** 2
+
+    focals = with_inconsistencies(monkeypatch, inconsistency)
+    monkeypatch.setattr(focal_sweep, "_stretched", lambda graph, found: found.inconsistency == 0.001)
+    tried = focal_sweep.sweep(SEARCH, 0.8 * DIAGONAL, DIAGONAL, given=False)
+    assert focal_sweep.least_of(tried).focal == pytest.approx(400, rel=0.05)
+    assert min(each.found.inconsistency for each in tried) > 0.001
+    focals.clear()
+    monkeypatch.setattr(focal_sweep, "_stretched", lambda graph, found: True)
+    tried = focal_sweep.sweep(SEARCH, 0.8 * DIAGONAL, DIAGONAL, given=False)
+    assert tried[0].focal == focals[0]
+    shortest = focal_sweep.FOCAL_RANGE[0] * DIAGONAL
+    assert shortest / focal_sweep.FOCAL_STEP < min(focals) <= shortest
 
 
 @pytest.mark.parametrize("given", [0.1, 0.15, 7.0, 20.0])
