@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import secrets
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import numpy as np
+from crafting import npy
 from long_jobs import LONG, long_sequence
 from network import Network
 from pliant.worker.processes.containment import die_with_parent
@@ -67,8 +66,8 @@ class Hosts:
         self.acknowledged: list[str] = []
         sequence = long_sequence()
         self._files = {
-            "tracks": ("tracks.npy", _npy(sequence.tracks.points)),
-            "rotations": ("rotations.npy", _npy(sequence.rotations)),
+            "tracks": ("tracks.npy", npy(sequence.tracks.points)),
+            "rotations": ("rotations.npy", npy(sequence.rotations)),
         }
 
     def __enter__(self) -> Hosts:
@@ -249,9 +248,3 @@ class Hosts:
         while self.at_work(host) and time.monotonic() < until:
             time.sleep(0.1)
         return not self.at_work(host)
-
-
-def _npy(array: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, array)
-    return buffer.getvalue()
