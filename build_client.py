@@ -28,7 +28,6 @@ NAMES = {
     "_async": "_sync",
     "aclosing": "closing",
     "aclose": "close",
-    "aread": "read",
     "aiter_bytes": "iter_bytes",
     "async_sleep": "sleep",
     "in_thread": "in_place",

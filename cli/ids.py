@@ -24,7 +24,7 @@ def find_job(client: Client, text: str) -> RemoteJob:
         The text is malformed, or more than one job matches.
     """
     from pliant.client import BadArgument, NotFound
-    from pliant.schemas.job import Problem
+    from pliant.schemas.job import LARGEST_PAGE, Problem
     from pliant.schemas.problems import ProblemCode
 
     if text == LAST:
@@ -39,7 +39,7 @@ def find_job(client: Client, text: str) -> RemoteJob:
     try:
         return client.get(text)
     except NotFound:
-        fitting = [job for job in islice(client.list(page_size=200), SEARCHED) if job.id.startswith(text)]
+        fitting = [job for job in islice(client.list(page_size=LARGEST_PAGE), SEARCHED) if job.id.startswith(text)]
         if len(fitting) == 0:
             raise
     if len(fitting) > 1:

@@ -168,7 +168,7 @@ def verdict_lines(result: Job | Finished) -> list[Text]:
     """Return the lines with the verdict and its reasons; empty if there is no verdict."""
     if result.verdict is None:
         return []
-    words, colour = _verdict(result)
+    words, colour = verdict_words(result)
     trust = result.trust_sentence
     if trust is not None and trust.startswith(UNESTIMATED):  # as `words` say
         trust = trust.removeprefix(UNESTIMATED).lstrip("; ").capitalize()
@@ -178,7 +178,7 @@ def verdict_lines(result: Job | Finished) -> list[Text]:
     ]
 
 
-def _verdict(result: Job | Finished) -> tuple[str, str]:
+def verdict_words(result: Job | Finished) -> tuple[str, str]:
     """Return the verdict in words and its colour; without an estimate of the error, the words say so, in no colour."""
     words, colour = VERDICTS.get(result.verdict or "", (result.verdict or "", "yellow"))
     if result.verdict is not None and (result.trust_sentence or "").startswith(UNESTIMATED):
@@ -246,7 +246,7 @@ def show_jobs(jobs: Iterable[Job], *, as_json: bool) -> None:
             Text(job.status if job.progress is None or job.status.final else f"{job.status} {job.progress.fraction:.0%}",
                  COLOURS[job.status]),
             f"{job.created_at.astimezone():%Y-%m-%d %H:%M}",
-            Text(*_verdict(job)),
+            Text(*verdict_words(job)),
             f"{job.interpretation.num_frames} × {job.interpretation.num_points or '?'}",  # a film may not be tracked yet
             Text(job.name),
         )

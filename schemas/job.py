@@ -20,6 +20,9 @@ LONGEST_NAME = 200
 LONGEST_KEY = 255
 """Maximum length of an idempotency key, characters."""
 
+LARGEST_PAGE = 200
+"""Maximum number of jobs on a page of a list."""
+
 
 class Status(StrEnum):
     """Status of a job. The last three are final and never change."""

@@ -56,15 +56,14 @@ def draw_points(
     *,
     size: tuple[int, int],
     scale: float,
-    centre: tuple[float, float] = (0.0, 0.0),
+    radius: int,
     colours: np.ndarray | None = None,
-    radius: int = 1,
 ) -> np.ndarray:
     """Draw points as small squares, the nearest (smallest z, if there is one) on top; return `(height, width, 3)` in [0, 1]."""
     height, width = size
     image = np.ones((height, width, 3))
     order = np.argsort(-points[:, 2]) if points.shape[1] == 3 else np.arange(len(points))
-    place = np.round((points[order, :2] - centre) * scale + (width / 2, height / 2)).astype(int)
+    place = np.round(points[order, :2] * scale + (width / 2, height / 2)).astype(int)
     paint = np.full((len(points), 3), 0.25) if colours is None else colours[order]
     for down in range(-radius, radius + 1):
         for right in range(-radius, radius + 1):

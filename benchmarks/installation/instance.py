@@ -122,7 +122,7 @@ class Instance:
         assert self._process is not None
         found: dict[str, list[int]] = {role: [] for role in (*ROLES, "valkey", "job process")}
         for pid in children(self._process.pid):
-            command = _command(pid)
+            command = command_of(pid)
             role = next((role for role, words in ROLES.items() if words in command), "valkey")
             found[role].append(pid)
         found["job process"] = [pid for worker in found["worker"] for pid in children(worker)]
@@ -213,8 +213,10 @@ def children(parent: int) -> list[int]:
 
 def running(pid: int) -> bool:
     """Return whether a process exists and is not a zombie."""
-    state = _state(pid)
-    return state is not None and state[0] != "Z"
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def resident(pid: int) -> int:
@@ -222,14 +224,8 @@ def resident(pid: int) -> int:
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def _state(pid: int) -> list[str] | None:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    except OSError:
-        return None
-
-
-def _command(pid: int) -> bytes:
+def command_of(pid: int) -> bytes:
+    """Return the arguments of a process, each with a zero byte after it; empty if it has ended."""
     try:
         return Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:

@@ -31,6 +31,8 @@ from pliant.worker.processes.supervisor import Supervisor, valkey_child, worker_
 from pliant.worker.processes.valkey import Valkey
 from pliant.worker.settings import Settings
 
+from benchmarks.installation.instance import children
+
 FAULTS = (
     "kill job process",
     "kill worker",
@@ -121,7 +123,7 @@ class Soak:
             return
         victim = self.random.choice(workers) if workers else None
         if fault == "kill job process":
-            victim = next(iter(_children(victim)), None) if victim is not None else None
+            victim = next(iter(children(victim)), None) if victim is not None else None
         elif fault == "kill reconciler":
             victim = pids.get("reconciler")
         elif fault in ("kill Valkey", OUTAGE):
@@ -221,19 +223,6 @@ def _send(pid: int, number: signal.Signals) -> None:
         os.kill(pid, number)
     except ProcessLookupError:
         return
-
-
-def _children(parent: int) -> list[int]:
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                words = (entry / "stat").read_text().rsplit(")", 1)[1].split()
-            except OSError:
-                continue
-            if int(words[1]) == parent and words[0] != "Z":
-                found.append(int(entry.name))
-    return found
 
 
 if __name__ == "__main__":

@@ -39,13 +39,12 @@ class Sizes:
         return {"frames": size, "points": self.fixed_points}
 
 
-def growth(work: Workload, sizes: Sizes | None = None, *, results: Path | None = None, command: str = "") -> list[str]:
+def growth(work: Workload, sizes: Sizes, *, results: Path | None, command: str) -> list[str]:
     """Measure; return the lines of the Markdown tables with the fitted exponents.
 
     Each measurement is appended to the JSON-lines file `results`, if given, with `command`.
     """
     lines: list[str] = []
-    sizes = Sizes() if sizes is None else sizes
     for name, values in sizes.series():
         _say(
             lines,

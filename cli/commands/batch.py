@@ -13,7 +13,7 @@ from pliant.cli.exits import Exit
 from pliant.cli.films import as_one_file, is_film
 from pliant.cli.paths import different_files, make_folder, output_folder, tracks_or_film
 from pliant.cli.session import LINE_EVERY, Session, name_of
-from pliant.cli.show import COLOURS, VERDICTS, details_of, err, find_explanation, out, print_json
+from pliant.cli.show import COLOURS, details_of, err, find_explanation, out, print_json, verdict_words
 from pliant.schemas.pictures import pictures_in
 
 if TYPE_CHECKING:
@@ -77,8 +77,7 @@ def describe_verdict(job: Job | None) -> Text:
 
     if job is None or job.verdict is None:
         return Text()
-    words, colour = VERDICTS.get(job.verdict, (job.verdict, "yellow"))
-    return Text.assemble((words, colour), *(f"\n{reason}" for reason in job.verdict_reasons[:1]))
+    return Text.assemble(verdict_words(job), *(f"\n{reason}" for reason in job.verdict_reasons[:1]))
 
 
 @dataclass(slots=True)

@@ -27,7 +27,7 @@ from pliant.client.pauses import in_thread
 from pliant.client.requests import further, key_header, sharing, status_names
 from pliant.client.result import finished, job_path, loaded, succeeded
 from pliant.client.retry import SUBMISSION
-from pliant.schemas.job import Inspection, Job, JobPage, Priority, ServiceLimits, Status
+from pliant.schemas.job import LARGEST_PAGE, Inspection, Job, JobPage, Priority, ServiceLimits, Status
 from pliant.schemas.options import Options, Output
 from pliant.schemas.shares import Share
 from pydantic import RootModel
@@ -294,9 +294,9 @@ class AsyncClient(AsyncConnection):
         exchange, wanted = self._exchange(timeout), status_names(statuses)
         if limit is not None and not (isinstance(limit, SupportsIndex) and limit >= 0):
             raise BadArgument(f"limit: expected at least 0 jobs, or None for all, got {limit!r}.")
-        if not (isinstance(page_size, SupportsIndex) and 1 <= page_size <= 200):
+        if not (isinstance(page_size, SupportsIndex) and 1 <= page_size <= LARGEST_PAGE):
             raise BadArgument(
-                f"page_size: expected 1 to 200 jobs, got {page_size!r}. Use limit for the number of jobs in all."
+                f"page_size: expected 1 to {LARGEST_PAGE} jobs, got {page_size!r}. Use limit for the number of jobs in all."
             )
         left = math.inf if limit is None else limit
         cursor: str | None = ""

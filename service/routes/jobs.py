@@ -8,7 +8,7 @@ from typing import Annotated
 
 from anyio import to_thread
 from fastapi import Depends, Header, Path, Query, Request, Response
-from pliant.schemas.job import LONGEST_KEY, Job, JobPage, Status
+from pliant.schemas.job import LARGEST_PAGE, LONGEST_KEY, Job, JobPage, Status
 from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Bound, Bounds, Core, Mine, Service, my_uploads
 from pliant.service.multipart import receive_form
@@ -19,7 +19,7 @@ from pliant.service.submission import accept, form_rules
 from pliant.worker.errors import StoreUnavailable, UnknownJob
 from pliant.worker.jobs.retry import retry as run_again
 from pliant.worker.jobs.service import Jobs
-from pliant.worker.jobs.validation import LARGEST_PAGE, check_key
+from pliant.worker.jobs.validation import check_key
 from pydantic import WithJsonSchema
 
 router = Router(prefix="/v1/jobs", tags=["jobs"])

@@ -7,14 +7,13 @@ import logging
 from typing import Annotated, Any, Literal
 
 from fastapi import Query
-from pliant.schemas.job import ServiceLimits
+from pliant.schemas.job import LARGEST_PAGE, ServiceLimits
 from pliant.schemas.options import Options
 from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Bound, Core
 from pliant.service.openapi import problems
 from pliant.service.problems import Refusal
 from pliant.service.routes.router import Router
-from pliant.worker.jobs.validation import LARGEST_PAGE
 
 router = Router(tags=["about"])
 

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from pliant.cli.commands.batch import Batch, Row
+from pliant.cli.commands.batch import Batch, Row, describe_verdict
 from pliant.cli.demo import MEANINGS, report
 from pliant.cli.exits import Exit
 from pliant.cli.session import Session
@@ -63,8 +63,10 @@ def test_a_verdict_without_an_error_estimate_says_so_first(capsys: pytest.Captur
     (line,) = verdict_lines(finished(verdict="good", verdict_reasons=(), trust_sentence=sentence))
     assert line.plain.startswith("Good, error not estimated  Depth rests on 41° of turn. ")
     assert not any("green" in str(span.style) for span in line.spans)
-    show_jobs([job(verdict="good", trust_sentence=sentence)], as_json=False)
+    good = job(verdict="good", trust_sentence=sentence)
+    show_jobs([good], as_json=False)
     assert "Good, error not estimated" in " ".join(capsys.readouterr().out.split())
+    assert describe_verdict(good).plain == "Good, error not estimated"
 
 
 def test_solve_states_the_camera(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import shutil
 import subprocess
@@ -12,23 +11,20 @@ from types import ModuleType
 
 import pytest
 
+import build_page
+
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
 def builder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """build_page.py, working on a copy of the sources in a temporary folder."""
-    spec = importlib.util.spec_from_file_location("build_page", ROOT / "build_page.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
     web = tmp_path / "web"
     shutil.copytree(ROOT / "service" / "web", web, ignore=shutil.ignore_patterns("node_modules", "dist*"))
-    monkeypatch.setattr(module, "WEB", web)
-    monkeypatch.setattr(module, "BUILT", web / "dist" / "index.html")
+    monkeypatch.setattr(build_page, "WEB", web)
+    monkeypatch.setattr(build_page, "BUILT", web / "dist" / "index.html")
     monkeypatch.delenv("PLIANT_PAGE", raising=False)
-    return module
+    return build_page
 
 
 def use_commands(builder: ModuleType, monkeypatch: pytest.MonkeyPatch, node: str, npm: str = "") -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -10,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from build_page import node_commands
 
 ROOT = Path(__file__).parents[2]
 WEB = ROOT / "service" / "web"
@@ -32,14 +33,9 @@ console.log(JSON.stringify(EXPRESSION));
 
 def node() -> list[str]:
     """The command that starts Node.js, as the build of the page finds it."""
-    spec = importlib.util.spec_from_file_location("build_page", ROOT / "build_page.py")
-    assert spec is not None
-    assert spec.loader is not None
-    build_page = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(build_page)
-    commands = build_page.node_commands()
+    commands = node_commands()
     assert commands is not None
-    return list(commands[0])
+    return commands[0]
 
 
 def evaluate(module: str, expression: str) -> Any:

@@ -35,6 +35,7 @@ from crafting import (
     header,
     mat_matrix,
     npy,
+    npz,
     ply,
     png,
 )
@@ -61,12 +62,6 @@ class Case:
     options: Mapping[str, Any] = field(default_factory=dict)
     limits: Limits = Limits()  # noqa: RUF009 - frozen
     words: str
-
-
-def npz(**arrays: Any) -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    return buffer.getvalue()
 
 
 def mat(version: str = "5", **arrays: Any) -> bytes:

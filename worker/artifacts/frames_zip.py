@@ -8,7 +8,7 @@ from typing import IO
 
 import numpy as np
 from pliant.solver.mesh import triangles_of
-from pliant.worker.artifacts.geometry import Floats, vertex_normals
+from pliant.worker.artifacts.geometry import Floats, Singles, vertex_normals
 from pliant.worker.artifacts.names import header_line, word
 from pliant.worker.artifacts.result import Result
 
@@ -59,9 +59,8 @@ def write_obj_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> N
     texture = result.texture
     head = "".join(f"# {line}\n" for line in _header_lines(result)) + (MATERIAL_HEAD if texture is not None else "")
     head += f"o {word(result.name)}\n"
-    moving = result.options.normals == "animated" and len(result.faces) > 0
-    places = "" if texture is None else _lines("vt", np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]), "%.6f")
-    corner = _corner(textured=texture is not None, moving=moving)
+    places = "" if texture is None else _lines("vt", texture.upright_uv(), "%.6f")
+    corner = _corner(textured=texture is not None, moving=result.normals_move)
     tail = "".join("f " + " ".join(corner.format(index + 1) for index in face) + "\n" for face in result.faces.tolist())
     if len(result.faces) == 0:
         tail = "".join(f"p {index + 1}\n" for index in range(result.solution.shapes.shape[1]))
@@ -88,8 +87,7 @@ def _frame(result: Result, frame: int) -> tuple[Floats, Floats | None, Floats | 
     """Return points, normals and sRGB colours `(P, 3)` of one frame; None for those not requested."""
     shape = result.standing(frame) if result.options.axes == "viewer" else result.solution.shapes[frame]
     points = shape.astype(np.float32).astype(np.float64)
-    moving = result.options.normals == "animated" and len(result.faces) > 0
-    normals = vertex_normals(points, triangles_of(result.faces)).astype(np.float64) if moving else None
+    normals = vertex_normals(points, triangles_of(result.faces)).astype(np.float64) if result.normals_move else None
     return points, normals, result.picture_colours if result.painting is None else result.painting.frame(frame)
 
 
@@ -110,7 +108,7 @@ def _header_lines(result: Result) -> list[str]:
     return lines
 
 
-def _lines(word: str, rows: Floats, number: str) -> str:
+def _lines(word: str, rows: Floats | Singles, number: str) -> str:
     """Return rows `(N, width)` as lines that start with a keyword."""
     line = " ".join([word] + [number] * rows.shape[1]) + "\n"
     return (line * len(rows)) % tuple(rows.ravel().tolist())

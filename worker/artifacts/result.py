@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from math import isclose
+from typing import Any
 
 import numpy as np
 from pliant.schemas.options import Options
@@ -94,6 +95,35 @@ class Result:
     def picture_colours(self) -> Floats | None:
         """Colours `(P, 3)` of the points in the texture, sRGB in [0, 1]; None without one or if colours show a metric."""
         return None if self.inputs.texture is None or self.painting is not None else self.inputs.texture.colours()
+
+    @property
+    def normals_move(self) -> bool:
+        """Whether files that show every frame have the normals of every frame."""
+        return self.options.normals == "animated" and len(self.faces) > 0
+
+    def arrays(self) -> dict[str, Any]:
+        """Return the arrays of `shapes.npz` by name; indices count from 0."""
+        solution, camera = self.solution, self.solution.camera
+        names, chosen = self.inputs.point_names, self.inputs.selection
+        posterior = {"shapes_std": solution.shapes_std, "inlier_probability": solution.inlier_probability}
+        return {
+            "shapes": solution.shapes,
+            "rotations": camera.rotations,
+            "scales": camera.scales,
+            "translations": camera.translations,
+            "focal": np.float64(np.inf if camera.focal is None else camera.focal),
+            "focal_std": np.float64(np.nan if camera.focal_std is None else camera.focal_std),
+            "principal_point": camera.principal_point,
+            "faces": self.faces,
+            "residuals": solution.residuals.astype(np.float32),
+            "weights": solution.weights.astype(np.float32),
+            **{name: array.astype(np.float32) for name, array in posterior.items() if array is not None},
+            "trace_objective": solution.trace.objective,
+            "trace_residual": solution.trace.residual,
+            "trace_iterations": solution.trace.iterations,
+            **({} if chosen is None else {"source_frames": chosen.frames, "source_points": chosen.points}),
+            **({} if names is None else {"point_names": np.array(names)}),
+        }
 
     def standing(self, frame: int) -> Floats:
         """Return the points `(P, 3)` of a frame, y up, right-handed."""

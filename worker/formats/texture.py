@@ -72,6 +72,10 @@ class Texture:
         """Return the texture of some of the points, by their indices."""
         return replace(self, uv=self.uv[points])
 
+    def upright_uv(self) -> NDArray[np.float32]:
+        """Return the texture coordinates `(P, 2)` with v up, (0, 0) the picture's lower left corner, as in OBJ, USD and Alembic."""
+        return np.column_stack([self.uv[:, 0], 1 - self.uv[:, 1]])
+
     def colours(self) -> NDArray[np.float64]:
         """Return the colours `(P, 3)` of the points, sRGB in [0, 1], interpolated bilinearly in the picture."""
         from PIL import Image

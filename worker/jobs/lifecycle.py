@@ -21,7 +21,7 @@ from pliant.worker.jobs.finished import Finished
 from pliant.worker.records import Stored
 
 ACTIVE = (Status.RUNNING, Status.CANCELLING)
-FINAL = (Status.SUCCEEDED, Status.FAILED, Status.CANCELLED)
+FINAL = tuple(status for status in Status if status.final)
 
 
 def again(job: Job, *, id: str, now: datetime, **changes: object) -> Job:

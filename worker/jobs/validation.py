@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import re
 
-from pliant.schemas.job import LONGEST_KEY
+from pliant.schemas.job import LARGEST_PAGE, LONGEST_KEY
 from pliant.worker.errors import InvalidRequest
-
-LARGEST_PAGE = 200
 
 _CURSOR = re.compile(r"[0-9]{14}:[A-Za-z0-9_-]{3,64}")
 _EVENT = re.compile(r"[0-9]{1,20}-[0-9]{1,20}")

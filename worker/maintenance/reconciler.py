@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 
-from pliant.schemas.job import Status
+from pliant.schemas.job import LARGEST_PAGE, Status
 from pliant.worker.errors import StaleAttempt, StoreUnavailable, UnknownJob
 from pliant.worker.execution.failures import worker_lost
 from pliant.worker.execution.workdir import clean_up
@@ -25,7 +25,6 @@ from pliant.worker.ids import new_attempt_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import RANKS, order_waiting
-from pliant.worker.jobs.validation import LARGEST_PAGE
 from pliant.worker.maintenance.retention import Retention, is_wanted
 from pliant.worker.records import Beat, dated
 from pliant.worker.store.outage import Outage, warn

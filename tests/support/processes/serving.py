@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import socket
@@ -19,6 +18,7 @@ from unittest import mock
 import httpx
 import numpy as np
 import uvicorn
+from crafting import npz
 from fastapi import FastAPI
 from pliant.schemas.job import Artifact, Job
 from pliant.service.settings import ServiceSettings
@@ -95,12 +95,6 @@ def heard(connection: socket.socket, words: bytes) -> bytes:
         assert piece, answer
         answer += piece
     return answer
-
-
-def npz(**arrays: Any) -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    return buffer.getvalue()
 
 
 def tracks(num_frames: int = 6, num_points: int = 12, *, seed: int = 0) -> bytes:

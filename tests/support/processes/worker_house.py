@@ -6,7 +6,6 @@ import os
 import signal
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 from long_jobs import LONG, long_sequence
@@ -20,6 +19,8 @@ from pliant.worker.maintenance.fsck import findings
 from pliant.worker.processes.supervisor import Child, Supervisor, valkey_child, worker_children
 from pliant.worker.processes.valkey import Valkey
 from pliant.worker.settings import Settings
+
+from benchmarks.installation.instance import children, running
 
 SHORT = Options(prior="smooth", max_reweightings=3, refine_rotations=False, surface="free", camera="orthographic")
 """Options of a short job: the default prior takes ten times as long."""
@@ -141,24 +142,6 @@ class House:
 
     def blobs_of(self, id: str) -> set[str]:
         return {key.rsplit("/", 1)[1] for key, _ in self.jobs.blobs.list(f"jobs/{id}/")}
-
-
-def children(pid: int) -> list[int]:
-    """Return the child processes that are not zombies."""
-    found: list[int] = []
-    with suppress(OSError):  # it has ended
-        for task in Path(f"/proc/{pid}/task").iterdir():
-            found += map(int, (task / "children").read_text().split())
-    return [child for child in found if running(child)]
-
-
-def running(pid: int) -> bool:
-    """Return True if the process exists and is not a zombie."""
-    try:
-        os.kill(pid, 0)
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 def settled(house: House) -> None:

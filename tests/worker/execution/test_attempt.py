@@ -114,12 +114,15 @@ def test_a_film_job_that_fails_keeps_the_warnings_about_its_film(
 
 
 def test_a_limit_of_memory_that_the_system_lacks_is_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
+    asked = []
+
+    def refuse(_: int, limits: tuple[int, int]) -> None:
+        asked.append(limits[0])
         raise ValueError("current limit exceeds maximum limit")
 
     monkeypatch.setattr("pliant.worker.execution.attempt.resource.setrlimit", refuse)
     with limited_memory(1 << 35):
-        pass
+        assert asked == [1 << 35]
 
 
 def test_an_attempt_stops_at_its_time_limit(attempt: Attempt, now: list[float]) -> None:

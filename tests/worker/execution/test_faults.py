@@ -26,7 +26,9 @@ from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 from rq import Queue as RqQueue
 from rq.serializers import JSONSerializer
-from worker_house import SHORT, House, children, make_long_inputs, running, settled
+from worker_house import SHORT, House, make_long_inputs, settled
+
+from benchmarks.installation.instance import children, running
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
 

@@ -17,7 +17,9 @@ from pliant.worker.store.connection import connect
 from rq import Queue as RqQueue
 from rq.registry import FailedJobRegistry, StartedJobRegistry
 from rq.serializers import JSONSerializer
-from worker_house import House, children
+from worker_house import House
+
+from benchmarks.installation.instance import children
 
 pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="job processes die with their worker on Linux"),

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from crafting import npy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pliant.solver import InvalidInput
@@ -18,12 +19,6 @@ from pliant.worker.formats.reading.arrays import read_npy, read_npz
 from pliant.worker.formats.records import Limits
 
 SMALL = Limits(max_bytes=1 << 20, max_members=4)
-
-
-def npy(array: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, array)
-    return buffer.getvalue()
 
 
 def header(text: str, data: bytes = b"", version: int = 1) -> bytes:

@@ -22,6 +22,8 @@ from pliant.worker.processes.valkey import Valkey, find_binary
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect, reachable
 
+from benchmarks.installation.instance import running
+
 
 def python(name: str, code: str, **more: object) -> Child:
     return Child(name=name, argv=[sys.executable, "-S", "-c", code], **more)  # type: ignore[arg-type]
@@ -32,14 +34,6 @@ def until(condition: Callable[[], object], seconds: float = 15.0) -> None:
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.02)
-
-
-def gone(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return True
-    return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
 
 
 SLEEP = "import time; time.sleep(600)"
@@ -75,7 +69,7 @@ def test_ended_children_are_restarted_with_growing_pauses(tmp_path: Path) -> Non
     assert supervisor.pids()["steady"] == steady
     supervisor.stop()
     assert supervisor.pids() == {}
-    assert gone(steady)
+    assert not running(steady)
 
 
 def test_a_child_that_cannot_be_started_again_is_tried_later_and_leaves_the_others_running(
@@ -91,7 +85,7 @@ def test_a_child_that_cannot_be_started_again_is_tried_later_and_leaves_the_othe
     monkeypatch.setattr(subprocess, "Popen", no_process)
     until(lambda: supervisor.look() or "cannot be started" in caplog.text)
     assert "short cannot be started: Resource temporarily unavailable. Trying again in 0.8 s" in caplog.text
-    assert not gone(steady)
+    assert running(steady)
     monkeypatch.setattr(subprocess, "Popen", start)
     until(lambda: supervisor.look() or "short" in supervisor.pids())
     supervisor.stop()
@@ -107,7 +101,7 @@ def test_an_unexpected_error_stops_the_children(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(supervisor, "look", fail)
     with pytest.raises(ValueError, match="a fault"):
         supervisor.run()
-    assert gone(started["steady"])
+    assert not running(started["steady"])
 
 
 def test_children_stop_before_foundations_and_are_killed_after_their_grace(tmp_path: Path) -> None:
@@ -135,7 +129,7 @@ def test_children_stop_before_foundations_and_are_killed_after_their_grace(tmp_p
     mule = supervisor.pids()["mule"]
     supervisor.stop()
     assert log.read_text().split() == ["house", "ground"]
-    assert gone(mule)
+    assert not running(mule)
 
 
 def test_a_child_that_never_becomes_ready_stops_the_rest() -> None:
@@ -164,7 +158,7 @@ def test_a_signal_stops_everything(number: signal.Signals) -> None:
     process.send_signal(number)
     assert process.wait(10) == 0
     process.stdout.close()
-    assert gone(child)
+    assert not running(child)
 
 
 def test_a_second_signal_kills_children_without_waiting() -> None:
@@ -179,7 +173,7 @@ def test_a_second_signal_kills_children_without_waiting() -> None:
     process.send_signal(signal.SIGTERM)
     assert process.wait(10) == 0
     process.stdout.close()
-    assert gone(child)
+    assert not running(child)
 
 
 def test_a_signal_during_start_stops_the_started_children() -> None:
@@ -193,7 +187,7 @@ def test_a_signal_during_start_stops_the_started_children() -> None:
     process.terminate()
     assert process.wait(10) == 0
     process.stdout.close()
-    assert gone(child)
+    assert not running(child)
 
 
 class Fake:
@@ -246,7 +240,7 @@ def test_children_end_with_a_killed_supervisor() -> None:
     process.kill()
     process.wait(10)
     process.stdout.close()
-    until(lambda: gone(child), 5)
+    until(lambda: not running(child), 5)
 
 
 def test_an_already_ended_parent_is_detected() -> None:

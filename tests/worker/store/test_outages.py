@@ -22,7 +22,9 @@ from pliant.worker.processes.valkey import disk_is_full, find_binary
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.store.connection import connect
-from worker_house import House, running, settled
+from worker_house import House, settled
+
+from benchmarks.installation.instance import running
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
 
