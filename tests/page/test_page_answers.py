@@ -12,7 +12,7 @@ import httpx
 import pytest
 from browsing import heard, why_not
 from paging import TRACKS, choose, refresh, until
-from playwright.sync_api import Page, Route, expect
+from playwright.sync_api import Dialog, Page, Route, expect
 
 pytestmark = [
     pytest.mark.chromium,
@@ -203,6 +203,28 @@ def test_a_repeated_submission_keeps_its_key_until_the_service_has_answered(
         heard(page, lambda count=count: len(keys) == count)
         expect(send).to_be_enabled()
     assert keys[0] == keys[1] == keys[2] != keys[3]
+
+
+def test_leaving_the_page_while_files_are_sent_is_asked_about(page: Page, url: str, small: dict[str, bytes]) -> None:
+    page.goto(url)
+    page.route("**/v1/jobs", lambda route: None)
+    choose(page, {TRACKS: small[TRACKS]})
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.get_by_role("button", name="Stop")).to_be_visible()
+    asked: list[str] = []
+
+    def stay(dialog: Dialog) -> None:
+        asked.append(dialog.type)
+        dialog.dismiss()
+
+    page.on("dialog", stay)
+    page.evaluate("setTimeout(() => location.reload())")
+    heard(page, lambda: asked == ["beforeunload"])
+    page.get_by_role("button", name="Stop").click()
+    expect(page.get_by_text("Stopped. Nothing was submitted.")).to_be_visible()
+    page.reload()
+    assert asked == ["beforeunload"], "nothing is lost any more"
+    page.remove_listener("dialog", stay)
 
 
 def positions(url: str, id: str) -> tuple[int, int, int, bytes]:

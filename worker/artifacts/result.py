@@ -130,9 +130,24 @@ class Result:
         return upright(self.solution.shapes[frame], self.y_axis)
 
 
+OUTPUTS_OF = {
+    "normals": ("glb", "ply", "obj", "usd"),
+    "colours": ("glb", "ply", "obj", "usd"),
+    "axes": ("ply", "obj"),
+    "glb_quantized": ("glb",),
+    "glb_motion": ("glb",),
+}
+"""Outputs on which an option has an effect."""
+
+
 def file_warnings(options: Options, solution: Solution) -> tuple[str, ...]:
-    """Return a sentence for each option that has no effect on the files of this solution."""
-    sentences = []
+    """Return a sentence for each option that was changed from its default, but has no effect on the files of this solution."""
+    default = Options()
+    sentences = [
+        f"{name} has no effect without {' or '.join(outputs)} in outputs."
+        for name, outputs in OUTPUTS_OF.items()
+        if getattr(options, name) != getattr(default, name) and not set(outputs) & set(options.outputs)
+    ]
     if options.colours == "expected_error" and solution.shapes_std is None:
         sentences.append("colours=expected_error has no effect, because the solution has no expected error.")
     if options.glb_motion == "frames" and "glb" in options.outputs and len(solution.shapes) > MAX_FRAME_TARGETS:

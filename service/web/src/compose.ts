@@ -249,9 +249,14 @@ export class Compose {
     return form;
   }
 
+  /** Ask before the page is left: leaving it ends the upload. */
+  private readonly stay = (event: BeforeUnloadEvent): void => event.preventDefault();
+
   private busy(busy: boolean): void {
     this.send.disabled = busy;
     this.stop.hidden = !busy;
+    if (busy) addEventListener("beforeunload", this.stay);
+    else removeEventListener("beforeunload", this.stay);
   }
 
   /** Show an error; `outcome` is what has become of the files, and `again` is called when the user has chosen one of several interpretations. */

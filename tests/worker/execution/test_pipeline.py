@@ -67,13 +67,35 @@ def test_options_without_effect_on_the_files_are_reported(inputs: Inputs, tmp_pa
     assert not any("no effect" in each for each in plain.warnings)
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "without", "within"),
+    [
+        ("normals", "none", "abc", "usd"),
+        ("colours", "error", "mdd", "obj"),
+        ("axes", "tracks", "glb", "ply"),
+        ("glb_quantized", True, "usd", "glb"),
+        ("glb_motion", "frames", "ply", "glb"),
+    ],
+)
+def test_options_of_files_that_are_not_written_are_reported(
+    option: str, value: object, without: str, within: str
+) -> None:
+    solution = SimpleNamespace(shapes=np.zeros((2, 1, 3)), shapes_std=None)
+    chosen = Options.model_validate({option: value, "outputs": [without]})
+    (sentence,) = file_warnings(chosen, solution)  # type: ignore[arg-type]
+    assert sentence.startswith(f"{option} has no effect without ")
+    assert within in sentence
+    assert file_warnings(Options.model_validate({option: value, "outputs": [within]}), solution) == ()  # type: ignore[arg-type]
+
+
 def test_more_frames_than_morph_targets_are_reported() -> None:
     few, many = (SimpleNamespace(shapes=np.zeros((frames, 1, 3)), shapes_std=None) for frames in (200, 201))
     options = Options(glb_motion="frames", outputs=("glb",))
     assert file_warnings(options, few) == ()  # type: ignore[arg-type]
     (sentence,) = file_warnings(options, many)  # type: ignore[arg-type]
     assert sentence.startswith("glb_motion=frames has no effect")
-    assert file_warnings(Options(glb_motion="frames", outputs=("ply",)), many) == ()  # type: ignore[arg-type]
+    (sentence,) = file_warnings(Options(glb_motion="frames", outputs=("ply",)), many)  # type: ignore[arg-type]
+    assert sentence == "glb_motion has no effect without glb in outputs."
 
 
 @pytest.mark.parametrize("stage", ["loading", "cameras", "initialise", "reweight", "exporting"])

@@ -150,6 +150,19 @@ def test_a_contradicted_layout_is_ambiguous(tmp_path: Path) -> None:
     assert "one.W and two.W" in two.got
 
 
+def test_points_in_place_of_frames_are_mentioned_in_a_note() -> None:
+    points = face(60, 400, degrees=50).tracks.points
+    swapped = {"tracks": points.transpose(1, 0, 2)}
+    reading = understand(swapped, Options())
+    assert reading.points.shape == (400, 60, 2)
+    (note,) = (note for note in reading.notes if "more frames than points" in note)
+    assert note.startswith("Read as tracks (F, P, 2) (mean step in time: ")
+    assert note.endswith("if they are swapped, set layout=points_frames.")
+    np.testing.assert_array_equal(understand(swapped, Options(layout="points_frames")).points, points)
+    for clear in ({"tracks": points}, {"tracks": points[:, ::10]}):
+        assert not any("more frames than points" in note for note in understand(clear, Options()).notes)
+
+
 def test_a_matrix_whose_x_and_y_are_the_same_in_every_layout_is_ambiguous() -> None:
     path = np.linspace(0.0, 100.0, 6)[:, None] + np.linspace(0.0, 500.0, 8)
     error = refused("ambiguous_layout", {"W": np.concatenate([path, path])})

@@ -170,7 +170,13 @@ def choose(
     known = np.isfinite(costs[best.layout]) or not others or not np.isfinite(array).any()  # `Tracks` refuses the last
     clear = known and all(costs[other.layout] >= MIN_SMOOTHNESS_RATIO * costs[best.layout] for other in others)
     if clear and costs[best.layout] <= CONTRADICTED * costs[ranked[0].layout]:
-        return best, [_comparison(best, others[0], costs)] if others else []
+        notes = [_comparison(best, others[0], costs)] if others else []
+        frames, count = best.points.shape[:2]
+        if ranked[0].order != best.order and frames > count:
+            notes.append(
+                f"{_comparison(best, ranked[0], costs)} There are more frames than points: if they are swapped, set {_ways(ranked[:1])}."
+            )
+        return best, notes
     choices: list[dict[str, Any]] = [
         {"layout": one.layout, "options": one.options, "evidence": _evidence(costs[one.layout])} for one in ranked
     ]
