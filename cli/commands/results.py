@@ -17,7 +17,6 @@ from pliant.cli.show import err, out, print_json, show_job
 
 
 def view(
-    ctx: typer.Context,
     result: Annotated[
         Path, typer.Argument(help="Folder of a result, or a file in it.", show_default=False, readable=False)
     ],
@@ -26,7 +25,6 @@ def view(
     as_json: Json = False,
 ) -> None:
     """Show a result folder in the web viewer, without a service or a queue. Ctrl-C stops it."""
-    ctx.obj.json = as_json
     require_server("pliant view")
     import uvicorn
     from pliant.client.errors import BadArgument
@@ -68,7 +66,7 @@ def share(
     as_json: Json = False,
 ) -> None:
     """Create and print a read-only link to a finished job's result. Anyone with the link sees this result and nothing else."""
-    with ctx.obj.client(url, as_json=as_json) as client:
+    with ctx.obj.client(url) as client:
         found = find_job(client, job).id
         if revoke is not None:
             client.revoke_share(found, revoke)
@@ -107,7 +105,7 @@ def rerun(
     start from their defaults.
     """
     options = parse_options(option)
-    with ctx.obj.client(url, as_json=as_json) as client:
+    with ctx.obj.client(url) as client:
         again = find_job(client, job).run_again(options, name=name)
         show_job(again.record, as_json=as_json)
         if not as_json:
