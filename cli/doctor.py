@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import platform
+import re
 import shutil
 import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -28,7 +29,6 @@ OLDEST_PYTHON = (3, 11)
 LITTLE_SPACE = 2 * 1024**3
 """Free bytes below which large jobs may not fit."""
 
-NEEDED = ("numpy", "scipy", "httpx", "pydantic", "h5py", "pillow", "plyfile")
 SERVER = ("fastapi", "uvicorn", "redis", "rq", "obstore", "python-multipart")
 EXTRAS = {"matplotlib": "result.plot()"}
 
@@ -123,7 +123,8 @@ def check_python() -> Iterator[Finding]:
 def check_packages(version_of: Callable[[str], str] = version) -> Iterator[Finding]:
     """Check the packages that Pliant needs or can use."""
     missing, held = [], []
-    for name in NEEDED:
+    needed = [re.split("[^A-Za-z0-9_.-]", each)[0] for each in requires("pliant") or () if "extra ==" not in each]
+    for name in needed:
         try:
             held.append(f"{name} {version_of(name)}")
         except PackageNotFoundError:

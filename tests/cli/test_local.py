@@ -198,9 +198,9 @@ def test_doctor_reports_missing_packages(monkeypatch: pytest.MonkeyPatch) -> Non
         return find
 
     assert verdicts(doctor.check_packages())["packages"] == "good"
-    broken = list(doctor.check_packages(without("scipy", "matplotlib")))
+    broken = list(doctor.check_packages(without("clarabel", "scipy", "matplotlib")))
     assert verdicts(broken) == {"packages": "bad", "server": "good", "matplotlib": "note"}
-    assert broken[0].found == "missing: scipy"
+    assert broken[0].found == "missing: clarabel, scipy"
     monkeypatch.setattr(doctor, "OLDEST_PYTHON", (4, 0))
     assert verdicts(doctor.check_python()) == {"Python": "bad"}
 
