@@ -1,4 +1,4 @@
-"""The name that a wrong name probably means: of an option of a job, a part of a form, or an option of a command."""
+"""The name that a wrong name probably means: of an option, a part of a form, a setting, or an error code."""
 
 from __future__ import annotations
 

@@ -41,16 +41,15 @@ def parse_code(text: str) -> ProblemCode:
     BadArgument
         There is no such code.
     """
-    from difflib import get_close_matches
-
     from pliant.client.errors import BadArgument
     from pliant.schemas.problems import ProblemCode, find_code
+    from pliant.schemas.suggestions import closest
 
     found = find_code(text)
     if found is None:
-        close = get_close_matches(text, list(ProblemCode), n=1)
-        meant = f" Did you mean {close[0]}?" if close else ""
-        raise BadArgument(f"CODE: there is no error code {text!r}.{meant} `pliant explain` lists all codes.")
+        meant = closest(text, list(ProblemCode))
+        suggestion = "" if meant is None else f" Did you mean {meant}?"
+        raise BadArgument(f"CODE: there is no error code {text!r}.{suggestion} `pliant explain` lists all codes.")
     return found
 
 
