@@ -100,7 +100,7 @@ def submit(
         job = _submit(session, client, given, wait=waits, output=output, force=force, as_json=as_json)
         show_job(job.record, as_json=as_json)
         if not job.status.final and not as_json:
-            err().print(f"Follow it with: pliant watch {job.id}", highlight=False)
+            err().print(f"Follow it with: pliant watch {job.id}")
 
 
 def _submit(
@@ -121,7 +121,7 @@ def _submit(
         if wait:
             session.following = job.id
             if not as_json:
-                err().print(f"Job {job.id}", highlight=False)
+                err().print(f"Job {job.id}")
             done = job.wait(on_progress=bar.on_progress, load=False, timeout=given["timeout"])
             if output is not None:
                 output_folder(output, force=force, files=different_files(done.job, output))
@@ -250,7 +250,7 @@ def delete(
     if as_json:
         print_json({"deleted": ids})
     else:
-        err().print(f"Deleted: {', '.join(ids)}", highlight=False)
+        err().print(f"Deleted: {', '.join(ids)}")
 
 
 def options(ctx: typer.Context, url: Url = "", as_json: Json = False) -> None:

@@ -157,7 +157,7 @@ def await_store(settings: Settings, *, within: float | None = None) -> bool:
     from pliant.worker.processes.preflight import wait_for_store
 
     try:
-        wait_for_store(settings, lambda message: err().print(message, markup=False, highlight=False), within=within)
+        wait_for_store(settings, lambda message: err().print(message), within=within)
     except KeyboardInterrupt:
         return False
     return True

@@ -73,14 +73,14 @@ def share(
             if as_json:
                 print_json({"revoked": revoke})
             else:
-                err().print(f"Revoked: {revoke}", highlight=False)
+                err().print(f"Revoked: {revoke}")
             return
         if listed:
             shares = client.shares(found)
             if as_json:
                 print_json([each.model_dump(mode="json") for each in shares])
             for each in () if as_json else shares:
-                out().print(f"{each.id}  valid until {each.expires_at:%Y-%m-%d %H:%M} UTC", highlight=False)
+                out().print(f"{each.id}  valid until {each.expires_at:%Y-%m-%d %H:%M} UTC")
             return
         made = client.share(found, days=days)
         address = f"{client.url}/{made.path}"
@@ -88,7 +88,7 @@ def share(
         print_json({**made.model_dump(mode="json"), "url": address})
     else:
         out().print(address)
-        err().print(f"Link {made.id}, valid until {made.expires_at:%Y-%m-%d %H:%M} UTC.", highlight=False)
+        err().print(f"Link {made.id}, valid until {made.expires_at:%Y-%m-%d %H:%M} UTC.")
 
 
 def rerun(
@@ -109,4 +109,4 @@ def rerun(
         again = find_job(client, job).run_again(options, name=name)
         show_job(again.record, as_json=as_json)
         if not as_json:
-            err().print(f"Follow it with: pliant watch {again.id}", highlight=False)
+            err().print(f"Follow it with: pliant watch {again.id}")
