@@ -73,31 +73,7 @@ def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0), textured: boo
 
 
 def _npz(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
-    solution, camera = result.solution, result.solution.camera
-    chosen = result.inputs.selection
-    sources = {} if chosen is None else {"source_frames": chosen.frames, "source_points": chosen.points}
-    posterior = {"shapes_std": solution.shapes_std, "inlier_probability": solution.inlier_probability}
-    names = result.inputs.point_names
-    np.savez(
-        file,
-        allow_pickle=False,
-        **sources,
-        **({} if names is None else {"point_names": np.array(names)}),
-        shapes=solution.shapes,
-        rotations=camera.rotations,
-        scales=camera.scales,
-        translations=camera.translations,
-        focal=np.float64(np.inf if camera.focal is None else camera.focal),
-        focal_std=np.float64(np.nan if camera.focal_std is None else camera.focal_std),
-        principal_point=camera.principal_point,
-        faces=result.faces,
-        residuals=solution.residuals.astype(np.float32),
-        weights=solution.weights.astype(np.float32),
-        **{name: array.astype(np.float32) for name, array in posterior.items() if array is not None},
-        trace_objective=solution.trace.objective,
-        trace_residual=solution.trace.residual,
-        trace_iterations=solution.trace.iterations,
-    )
+    np.savez(file, allow_pickle=False, **result.arrays())
     on_progress(1.0)
     return {}
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from math import isclose
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.schemas.options import Options
 from pliant.solver import Solution
 from pliant.solver.evaluation.alignment import align
@@ -84,6 +86,30 @@ class Result:
         if self.distances is not None:
             return Painting.of("distance from the truth", self.distances, unit="the ground truth's unit")
         return Painting.of("reprojection residual", self.solution.residuals, seen)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays of `shapes.npz` by name; docs/reference/artifacts.md describes them."""
+        solution, camera, trace = self.solution, self.solution.camera, self.solution.trace
+        names, chosen = self.inputs.point_names, self.inputs.selection
+        posterior = {"shapes_std": solution.shapes_std, "inlier_probability": solution.inlier_probability}
+        return {
+            "shapes": solution.shapes,
+            "rotations": camera.rotations,
+            "scales": camera.scales,
+            "translations": camera.translations,
+            "focal": np.array(np.inf if camera.focal is None else camera.focal),
+            "focal_std": np.array(np.nan if camera.focal_std is None else camera.focal_std),
+            "principal_point": camera.principal_point,
+            "faces": self.faces,
+            "residuals": solution.residuals.astype(np.float32),
+            "weights": solution.weights.astype(np.float32),
+            **{name: array.astype(np.float32) for name, array in posterior.items() if array is not None},
+            "trace_objective": trace.objective,
+            "trace_residual": trace.residual,
+            "trace_iterations": trace.iterations,
+            **({} if chosen is None else {"source_frames": chosen.frames, "source_points": chosen.points}),
+            **({} if names is None else {"point_names": np.array(names)}),
+        }
 
     @property
     def texture(self) -> Texture | None:
