@@ -59,9 +59,8 @@ def write_obj_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> N
     texture = result.texture
     head = "".join(f"# {line}\n" for line in _header_lines(result)) + (MATERIAL_HEAD if texture is not None else "")
     head += f"o {word(result.name)}\n"
-    moving = result.options.normals == "animated" and len(result.faces) > 0
     places = "" if texture is None else _lines("vt", np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]), "%.6f")
-    corner = _corner(textured=texture is not None, moving=moving)
+    corner = _corner(textured=texture is not None, moving=result.moving_normals)
     tail = "".join("f " + " ".join(corner.format(index + 1) for index in face) + "\n" for face in result.faces.tolist())
     if len(result.faces) == 0:
         tail = "".join(f"p {index + 1}\n" for index in range(result.solution.shapes.shape[1]))
@@ -88,8 +87,9 @@ def _frame(result: Result, frame: int) -> tuple[Floats, Floats | None, Floats | 
     """Return points, normals and sRGB colours `(P, 3)` of one frame; None for those not requested."""
     shape = result.standing(frame) if result.options.axes == "viewer" else result.solution.shapes[frame]
     points = shape.astype(np.float32).astype(np.float64)
-    moving = result.options.normals == "animated" and len(result.faces) > 0
-    normals = vertex_normals(points, triangles_of(result.faces)).astype(np.float64) if moving else None
+    normals = None
+    if result.moving_normals:
+        normals = vertex_normals(points, triangles_of(result.faces)).astype(np.float64)
     return points, normals, result.picture_colours if result.painting is None else result.painting.frame(frame)
 
 

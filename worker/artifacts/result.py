@@ -121,6 +121,11 @@ class Result:
         """Colours `(P, 3)` of the points in the texture, sRGB in [0, 1]; None without one or if colours show a metric."""
         return None if self.inputs.texture is None or self.painting is not None else self.inputs.texture.colours()
 
+    @property
+    def moving_normals(self) -> bool:
+        """Whether every frame has normals of its own: if the options request them and there is a mesh."""
+        return self.options.normals == "animated" and len(self.faces) > 0
+
     def standing(self, frame: int) -> Floats:
         """Return the points `(P, 3)` of a frame, y up, right-handed."""
         return upright(self.solution.shapes[frame], self.y_axis)

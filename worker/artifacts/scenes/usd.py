@@ -65,7 +65,6 @@ def _build(path: Path, result: Result, on_progress: Callable[[float], None]) -> 
     shape = _define(stage, result)
     stage.SetDefaultPrim(shape.GetPrim())
     points, extent = shape.CreatePointsAttr(), shape.CreateExtentAttr()
-    moving = result.options.normals == "animated" and len(result.faces) > 0
     painted = result.painting
     frames = len(result.solution.shapes)
     for frame, code in enumerate(result.time_codes.tolist()):
@@ -73,7 +72,7 @@ def _build(path: Path, result: Result, on_progress: Callable[[float], None]) -> 
         points.Set(Vt.Vec3fArray.FromNumpy(standing.astype(np.float32)), code)
         corners = np.stack([standing.min(axis=0), standing.max(axis=0)]).astype(np.float32)
         extent.Set(Vt.Vec3fArray.FromNumpy(corners), code)
-        if moving:
+        if result.moving_normals:
             normals = vertex_normals(standing, triangles_of(result.faces))
             shape.CreateNormalsAttr().Set(Vt.Vec3fArray.FromNumpy(normals), code)
         if painted is not None:
