@@ -210,7 +210,7 @@ class PliantWorker(Worker):
 
     def main_work_horse(self, job: RqJob, queue: RqQueue) -> None:
         """Run the delivery in the job process, which ends with the worker."""
-        die_with_parent(int(os.environ["PLIANT_WORKER_PROCESS"]))
+        die_with_parent(int(os.environ["PLIANT_WORKER_PROCESS"]), how=signal.SIGKILL)
         job.settings = self._settings  # type: ignore[attr-defined]
         super().main_work_horse(job, queue)
 

@@ -12,6 +12,7 @@ import errno
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
 import tempfile
@@ -173,7 +174,7 @@ class _Progress:
 
 def serve(handle: Callable[[dict[str, Any]], str]) -> int:
     """Run as the contained process: read the request, call `handle`, write its answer or error; return the exit code."""
-    die_with_parent(int(sys.argv[1]))
+    die_with_parent(int(sys.argv[1]), how=signal.SIGKILL)
     try:
         try:
             answer, code = handle(json.load(sys.stdin)), DONE

@@ -15,7 +15,7 @@ _PR_SET_PDEATHSIG = 1
 _libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
 
-def die_with_parent(parent: int, *, how: signal.Signals = signal.SIGKILL) -> None:
+def die_with_parent(parent: int, *, how: signal.Signals) -> None:
     """Make the kernel signal this process when its parent ends (Linux; elsewhere a job process polls its parent's id).
 
     `parent` is the parent's process id, taken before the fork, because the parent may already have ended.
