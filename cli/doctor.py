@@ -159,7 +159,8 @@ def check_blas() -> Iterator[Finding]:
     import os
 
     import numpy as np
-    from pliant.worker.settings import NUMERICAL_THREADS, usable_cores
+    from pliant.worker.processes.containment import NUMERICAL_THREADS
+    from pliant.worker.settings import usable_cores
 
     a = np.random.default_rng(0).normal(size=(1000, 1000))
     a @ a

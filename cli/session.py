@@ -119,6 +119,6 @@ def one_numerical_thread() -> None:
 
     Call it before NumPy is imported: the libraries read these variables on import.
     """
-    from pliant.worker.settings import NUMERICAL_THREADS
+    from pliant.worker.processes.containment import NUMERICAL_THREADS
 
     os.environ.update(dict.fromkeys(NUMERICAL_THREADS, "1"))

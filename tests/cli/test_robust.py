@@ -26,7 +26,7 @@ from pliant.client import BadArgument
 from pliant.schemas.problems import ProblemCode
 from pliant.service.testing import InMemoryService
 from pliant.worker.errors import TimedOut
-from pliant.worker.settings import NUMERICAL_THREADS
+from pliant.worker.processes.containment import NUMERICAL_THREADS
 from serving import until
 from typer.testing import CliRunner, Result
 
