@@ -56,8 +56,7 @@ def find_binary() -> Path:
         if found is not None:
             return Path(found)
     raise ServerFailed(
-        "No Valkey server for this machine was found. Install valkey-server or redis-server, or set PLIANT_REDIS_URL.",
-        log="",
+        "No Valkey server for this machine was found. Install valkey-server or redis-server, or set PLIANT_REDIS_URL."
     )
 
 
@@ -87,7 +86,6 @@ class Valkey:
         binary = find_binary()
         home, path = valkey_directory(data), socket_path(data)
         make_data_directory(data)
-        home.mkdir(parents=True, exist_ok=True, mode=0o700)
         supervisor_lock = os.open(home / "supervisor.lock", os.O_RDWR | os.O_CREAT, 0o600)
         if not _lock(supervisor_lock):
             holder = os.read(supervisor_lock, 20).decode(errors="replace").strip()
@@ -237,7 +235,7 @@ def _make_private(directory: Path, *, home: Path) -> None:
         if directory == home:
             what = f"{directory} is a symbolic link, or belongs to another user."
             remedy = "Run the command as the user that runs Pliant, for example with `sudo -u pliant`."
-        raise ServerFailed(f"{what} {remedy}", log="")
+        raise ServerFailed(f"{what} {remedy}")
 
 
 def _lock(descriptor: int) -> bool:
