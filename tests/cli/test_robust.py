@@ -373,6 +373,17 @@ def test_server_commands_say_what_to_install(
     )
 
 
+@pytest.mark.parametrize("absent", ["prometheus_client", "pythonjsonlogger"])
+def test_server_commands_need_every_module_that_the_service_imports(
+    absent: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, absent, None)
+    ran = CliRunner().invoke(app, ["up"])
+    assert ran.exit_code == Exit.UNHEALTHY
+    assert "pliant up needs the service, which is not installed" in words(ran)
+
+
 @pytest.mark.parametrize(
     "command", [["fsck"], ["backup", "copy"], ["token", "list"], ["token", "revoke", "t1"]], ids=" ".join
 )
