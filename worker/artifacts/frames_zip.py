@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import IO
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.solver.mesh import triangles_of
 from pliant.worker.artifacts.geometry import Floats, vertex_normals
 from pliant.worker.artifacts.names import header_line, word
@@ -59,7 +60,7 @@ def write_obj_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> N
     texture = result.texture
     head = "".join(f"# {line}\n" for line in _header_lines(result)) + (MATERIAL_HEAD if texture is not None else "")
     head += f"o {word(result.name)}\n"
-    places = "" if texture is None else _lines("vt", np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]), "%.6f")
+    places = "" if texture is None else _lines("vt", texture.uv_up, "%.6f")
     corner = _corner(textured=texture is not None, moving=result.moving_normals)
     tail = "".join("f " + " ".join(corner.format(index + 1) for index in face) + "\n" for face in result.faces.tolist())
     if len(result.faces) == 0:
@@ -110,7 +111,7 @@ def _header_lines(result: Result) -> list[str]:
     return lines
 
 
-def _lines(word: str, rows: Floats, number: str) -> str:
+def _lines(word: str, rows: Floats | NDArray[np.float32], number: str) -> str:
     """Return rows `(N, width)` as lines that start with a keyword."""
     line = " ".join([word] + [number] * rows.shape[1]) + "\n"
     return (line * len(rows)) % tuple(rows.ravel().tolist())

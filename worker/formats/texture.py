@@ -29,6 +29,11 @@ class Texture:
     uv: NDArray[np.float32]
     """Shape `(P, 2)`, in [0, 1]: u right, v down, (0, 0) the picture's upper left corner, as in glTF."""
 
+    @property
+    def uv_up(self) -> NDArray[np.float32]:
+        """The coordinates with v up, from the picture's lower left corner, as in OBJ, USD and Alembic."""
+        return np.column_stack([self.uv[:, 0], 1 - self.uv[:, 1]])
+
     @classmethod
     def from_tracked(cls, template_rgb: ArrayLike, uv: ArrayLike) -> Texture:
         """Encode a template frame, uint8 RGB `(H, W, 3)`, with coordinates `(P, 2)` in [0, 1], u right, v down.

@@ -78,8 +78,7 @@ def _mesh_writer(parent: Any, sampling: int, result: Result) -> Callable[[Any], 
         first = False
         sample = AbcGeom.OPolyMeshSchemaSample(points, indices, counts)
         if result.texture is not None:
-            places = np.column_stack([result.texture.uv[:, 0], 1 - result.texture.uv[:, 1]]).astype(np.float32)
-            array = imath.V2fArrayFromBuffer(np.ascontiguousarray(places))
+            array = imath.V2fArrayFromBuffer(result.texture.uv_up)
             # One indexed value for each corner of a face: the form that every reader supports.
             corners = imath.UnsignedIntArray(faces.size)
             for number, index in enumerate(faces.reshape(-1).tolist()):

@@ -135,10 +135,9 @@ def _put_picture(stage: Any, shape: Any, texture: Texture) -> None:
     """Bind a material with the texture: a UsdPreviewSurface with texture coordinates `st`, whose t points up."""
     from pxr import Sdf, UsdGeom, UsdShade, Vt
 
-    places = np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]).astype(np.float32)
     kinds = Sdf.ValueTypeNames
     coordinates = UsdGeom.PrimvarsAPI(shape).CreatePrimvar("st", kinds.TexCoord2fArray, UsdGeom.Tokens.vertex)
-    coordinates.Set(Vt.Vec2fArray.FromNumpy(places))
+    coordinates.Set(Vt.Vec2fArray.FromNumpy(texture.uv_up))
     path = shape.GetPath().AppendChild("film")
     material = UsdShade.Material.Define(stage, path)
     surface, picture, reader = (
