@@ -18,7 +18,7 @@ import typer
 from pliant.cli.exits import Exit
 from pliant.cli.extras import require_server
 from pliant.cli.paths import RESULT_FILES, different_files, output_folder
-from pliant.cli.session import LINE_EVERY, Force, Json, Session
+from pliant.cli.session import LINE_EVERY, Force, Json
 from pliant.cli.show import METRIC_MEANINGS, err, out, print_json, show_warnings, verdict_lines
 
 if TYPE_CHECKING:
@@ -88,8 +88,6 @@ def demo(
 
     Compares the tracks and the mesh with the ground truth. The exit code is 0 only if the errors are small.
     """
-    session: Session = ctx.obj
-    session.json = as_json
     require_server("pliant demo")
     force = force or output is None
     output = DEMO_OUTPUT if output is None else output
@@ -102,7 +100,7 @@ def demo(
     with tempfile.TemporaryDirectory(prefix="pliant-demo-") as folder, running(Path(folder)) as url:
         from pliant.client.progress import progress_bar
 
-        with session.client(url, as_json=as_json) as client, progress_bar(line_every=LINE_EVERY) as bar:
+        with ctx.obj.client(url) as client, progress_bar(line_every=LINE_EVERY) as bar:
             job = client.submit(
                 film=output / "film.mp4",
                 region=output / "region.png",

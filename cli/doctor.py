@@ -59,8 +59,6 @@ def doctor(
     as_json: Json = False,
 ) -> None:
     """Check the installation; exit code 8 if something must be fixed."""
-    session: Session = ctx.obj
-    session.json = as_json
     findings = [
         *check_python(),
         *check_packages(),
@@ -74,17 +72,15 @@ def doctor(
         *check_blobs(),
     ]
     report(
-        [*findings, *check_port(port_here() if port is None else port), *check_service(session, url)], as_json=as_json
+        [*findings, *check_port(port_here() if port is None else port), *check_service(ctx.obj, url)], as_json=as_json
     )
 
 
-def fsck(ctx: typer.Context, data: Data = None, as_json: Json = False) -> None:
+def fsck(data: Data = None, as_json: Json = False) -> None:
     """Compare job records, queue, files, uploads and scratch directories; exit code 8 if they are inconsistent.
 
     Needs a running queue: run it beside `pliant up`, or with PLIANT_REDIS_URL.
     """
-    session: Session = ctx.obj
-    session.json = as_json
     require_server("pliant fsck")
     settings = read_settings(data, None)
     installation(settings)
@@ -184,7 +180,8 @@ def check_blas() -> Iterator[Finding]:
     import os
 
     import numpy as np
-    from pliant.worker.settings import NUMERICAL_THREADS, usable_cores
+    from pliant.worker.processes.containment import NUMERICAL_THREADS
+    from pliant.worker.settings import usable_cores
 
     a = np.random.default_rng(0).normal(size=(1000, 1000))
     a @ a
@@ -301,7 +298,7 @@ def check_service(session: Session, url: str) -> Iterator[Finding]:
     from pliant.client.errors import PliantError
 
     try:
-        with session.client(url, as_json=session.json, first_contact=0.5) as client:
+        with session.client(url, first_contact=0.5) as client:
             state = client.ready(timeout=3)
     except PliantError as fault:
         yield Finding(

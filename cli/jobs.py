@@ -73,7 +73,6 @@ def submit(
     from pliant.cli.commands.batch import Batch, expand
 
     session: Session = ctx.obj
-    session.json = as_json
     options, chosen, waits = parse_options(option), expand(files, region), wait or output is not None
     parts = {"mesh": mesh, "ground_truth": ground_truth, "rotations": rotations, "webhook": webhook}
     if chosen != files or len(chosen) > 1:
@@ -83,7 +82,7 @@ def submit(
             wait=waits, url=url, session=session,
         )  # fmt: skip
         batch.check(name=name, job_id=job_id, region=region)
-        with session.client(url, as_json=as_json) as client:
+        with session.client(url) as client:
             batch.run(client)
         batch.show(as_json=as_json)
         raise typer.Exit(batch.exit_code)
@@ -97,15 +96,22 @@ def submit(
     given["film" if is_film(tracks, region) else "tracks"] = tracks
     known = job_id is not None or key is not None  # a named job may be an earlier one, whose files may be here already
     place = nullcontext() if output is None else results_folder(output, force=force or known)
-    with place, session.client(url, as_json=as_json) as client:
-        job = _submit(session, client, given, wait=waits, output=output, force=force)
+    with place, session.client(url) as client:
+        job = _submit(session, client, given, wait=waits, output=output, force=force, as_json=as_json)
         show_job(job.record, as_json=as_json)
         if not job.status.final and not as_json:
-            err().print(f"Follow it with: pliant watch {job.id}", highlight=False)
+            err().print(f"Follow it with: pliant watch {job.id}")
 
 
 def _submit(
-    session: Session, client: Client, given: dict[str, Any], *, wait: bool, output: Path | None, force: bool
+    session: Session,
+    client: Client,
+    given: dict[str, Any],
+    *,
+    wait: bool,
+    output: Path | None,
+    force: bool,
+    as_json: bool,
 ) -> RemoteJob:
     """Submit one job with a progress bar; if requested, wait for it and download its files."""
     from pliant.client.progress import progress_bar
@@ -114,8 +120,8 @@ def _submit(
         job = client.submit(**given, on_upload=bar.on_upload)
         if wait:
             session.following = job.id
-            if not session.json:
-                err().print(f"Job {job.id}", highlight=False)
+            if not as_json:
+                err().print(f"Job {job.id}")
             done = job.wait(on_progress=bar.on_progress, load=False, timeout=given["timeout"])
             if output is not None:
                 output_folder(output, force=force, files=different_files(done.job, output))
@@ -125,7 +131,7 @@ def _submit(
 
 def status(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) -> None:
     """Print a job's current record."""
-    with ctx.obj.client(url, as_json=as_json) as client:
+    with ctx.obj.client(url) as client:
         show_job(find_job(client, job).record, as_json=as_json)
 
 
@@ -133,7 +139,7 @@ def watch(ctx: typer.Context, job: JobId, url: Url = HOME, timeout: Timeout = No
     """Follow a job until it is finished; exit code 1 if it failed or was cancelled."""
     from pliant.client.progress import progress_bar
 
-    with ctx.obj.client(url, as_json=as_json) as client:
+    with ctx.obj.client(url) as client:
         ctx.obj.following = found = find_job(client, job).id
         with progress_bar(line_every=LINE_EVERY) as bar:
             done = client.wait(found, on_progress=bar.on_progress, load=False, timeout=timeout)
@@ -165,7 +171,7 @@ def result(
 
     if fps is not None and not make:
         raise BadArgument("--fps: expected --make beside it. The stored files keep the frame rate of their job.")
-    with ctx.obj.client(url, as_json=as_json) as client:
+    with ctx.obj.client(url) as client:
         found = find_job(client, job).id
         if make:
             further = client.make_outputs(found, ",".join(make), fps=fps, timeout=timeout)
@@ -201,14 +207,14 @@ def list_jobs(
     unknown = sorted(set(status or ()) - set(Status))
     if len(unknown) > 0:
         raise BadArgument(f"--status: expected one of {', '.join(Status)}, got {unknown[0]!r}.")
-    with ctx.obj.client(url, as_json=as_json) as client:
+    with ctx.obj.client(url) as client:
         jobs = client.list(statuses=status or (), limit=limit, page_size=100)
         show_jobs([job.record for job in jobs], as_json=as_json)
 
 
 def log(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) -> None:
     """Print a job's log."""
-    with ctx.obj.client(url, as_json=as_json) as client:
+    with ctx.obj.client(url) as client:
         lines = find_job(client, job).log().splitlines()
     if as_json:
         print_json(lines)
@@ -219,13 +225,13 @@ def log(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) 
 
 def cancel(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) -> None:
     """Stop a job."""
-    with ctx.obj.client(url, as_json=as_json) as client:
+    with ctx.obj.client(url) as client:
         show_job(find_job(client, job).cancel().record, as_json=as_json)
 
 
 def retry(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) -> None:
     """Run a failed or cancelled job again, and print the new job."""
-    with ctx.obj.client(url, as_json=as_json) as client:
+    with ctx.obj.client(url) as client:
         show_job(find_job(client, job).retry().record, as_json=as_json)
 
 
@@ -236,7 +242,7 @@ def delete(
     as_json: Json = False,
 ) -> None:
     """Delete jobs and their files from the service."""
-    with ctx.obj.client(url, as_json=as_json) as client:
+    with ctx.obj.client(url) as client:
         found = {job.id: job for job in [find_job(client, job) for job in jobs]}  # find all before deleting the first
         for job in found.values():
             job.delete()
@@ -244,7 +250,7 @@ def delete(
     if as_json:
         print_json({"deleted": ids})
     else:
-        err().print(f"Deleted: {', '.join(ids)}", highlight=False)
+        err().print(f"Deleted: {', '.join(ids)}")
 
 
 def options(ctx: typer.Context, url: Url = "", as_json: Json = False) -> None:
@@ -254,6 +260,6 @@ def options(ctx: typer.Context, url: Url = "", as_json: Json = False) -> None:
 
         schema = Options.model_json_schema()
     else:
-        with ctx.obj.client(url, as_json=as_json) as client:
+        with ctx.obj.client(url) as client:
             schema = client.options()
     show_options(schema, as_json=as_json)

@@ -66,7 +66,6 @@ HOME = "http://127.0.0.1:8000"
 class Session:
     """One run of the command line."""
 
-    json: bool = False
     transport: httpx.BaseTransport | None = None
     """Replaces the network in tests."""
     url: str | None = None
@@ -76,12 +75,12 @@ class Session:
     others: int = 0
     """Number of further jobs that the command has submitted and not yet waited for."""
 
-    def client(self, url: str, *, as_json: bool, first_contact: float | None = None) -> Client:
+    def client(self, url: str, *, first_contact: float | None = None) -> Client:
         """Return a client; the token comes from PLIANT_TOKEN, so that it never appears in process listings."""
         from pliant.client import Client
         from pliant.client.retry import Retry
 
-        self.json, self.url = as_json, url
+        self.url = url
         retries = Retry() if first_contact is None else Retry(first_contact=first_contact)
         return Client(url, transport=self.transport, retries=retries)
 
@@ -120,6 +119,6 @@ def one_numerical_thread() -> None:
 
     Call it before NumPy is imported: the libraries read these variables on import.
     """
-    from pliant.worker.settings import NUMERICAL_THREADS
+    from pliant.worker.processes.containment import NUMERICAL_THREADS
 
     os.environ.update(dict.fromkeys(NUMERICAL_THREADS, "1"))

@@ -42,7 +42,6 @@ Threads = Annotated[int | None, typer.Option("--threads", help="Threads to use; 
 
 
 def solve(
-    ctx: typer.Context,
     tracks: Tracks,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the files.", show_default=False)],
     mesh: Mesh = None,
@@ -56,7 +55,6 @@ def solve(
     as_json: Json = False,
 ) -> None:
     """Reconstruct tracks or a film in this process, without a service. It writes the same files as a job."""
-    ctx.obj.json = as_json
     one_numerical_thread()  # the first check of a path imports NumPy
     check_inputs(tracks, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=region)
     options, name, film = parse_options(option), name_of(name, tracks), is_film(tracks, region)
@@ -140,7 +138,6 @@ def inspect(
     as_json: Json = False,
 ) -> None:
     """Show how a track file is interpreted, or a film's properties, with estimates of time and memory, without solving."""
-    ctx.obj.json = as_json
     check_inputs(file, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=region)
     options = parse_options(option)
     if url == "" and is_film(file, region):
@@ -156,7 +153,7 @@ def inspect(
             tracks=file, mesh=faces, ground_truth=ground_truth, rotations=rotations, options=checked
         ).interpretation
     else:
-        with ctx.obj.client(url, as_json=as_json) as client:
+        with ctx.obj.client(url) as client:
             interpretation = client.inspect(
                 **{"film" if is_film(file, region) else "tracks": file}, region=region, mesh=mesh,
                 ground_truth=ground_truth, rotations=rotations, options=options,

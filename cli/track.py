@@ -27,7 +27,6 @@ Film = Annotated[
 
 
 def track(
-    ctx: typer.Context,
     film: Film,
     output: Annotated[Path, typer.Option("--output", "-o", help="tracks.npz to write.", show_default=False)],
     region: Annotated[
@@ -55,7 +54,6 @@ def track(
     as_json: Json = False,
 ) -> None:
     """Track the surface that a film shows. Needs OpenCV, which the extra `film` installs."""
-    ctx.obj.json = as_json
     one_numerical_thread()
     input_file(region, "--region")
     others = [film, region]

@@ -61,7 +61,6 @@ Auth = Annotated[
 
 
 def up(
-    ctx: typer.Context,
     host: Host = None,
     port: Port = None,
     data: Data = None,
@@ -73,7 +72,6 @@ def up(
 
     Without PLIANT_REDIS_URL it also runs a Valkey server, whose data is in the data directory.
     """
-    ctx.obj.json = as_json
     require_server("pliant up")
     from pliant.service.settings import ServiceSettings
     from pliant.worker.processes.preflight import check_settings, open_data_directory
@@ -116,9 +114,8 @@ def _announce(url: str, settings: Settings, *, as_json: bool) -> None:
     )
 
 
-def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json: Json = False) -> None:
+def work(data: Data = None, workers: Workers = None, as_json: Json = False) -> None:
     """Run only workers, for a service that uses the same PLIANT_REDIS_URL and PLIANT_BLOB_URL."""
-    ctx.obj.json = as_json
     require_server("pliant work")
     from pliant.worker.processes.preflight import check_settings, open_data_directory
     from pliant.worker.processes.supervisor import Supervisor, worker_children
@@ -160,7 +157,7 @@ def await_store(settings: Settings, *, within: float | None = None) -> bool:
     from pliant.worker.processes.preflight import wait_for_store
 
     try:
-        wait_for_store(settings, lambda message: err().print(message, markup=False, highlight=False), within=within)
+        wait_for_store(settings, lambda message: err().print(message), within=within)
     except KeyboardInterrupt:
         return False
     return True

@@ -38,6 +38,11 @@ Weight = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 Output = Literal["glb", "ply", "obj", "usd", "abc", "mdd", "mat", "csv"]
 """A result file written on request; `shapes.npz`, `report.json` and `preview.bin` are always written."""
 
+Normals = Literal["static", "animated", "none"]
+Colours = Literal["none", "error", "expected_error"]
+Axes = Literal["tracks", "viewer"]
+GlbMotion = Literal["auto", "frames"]
+
 
 def _listed(given: object) -> object:
     """Accept `"glb,mat"` for `["glb", "mat"]`, as sent by command lines and forms."""
@@ -208,18 +213,18 @@ class Options(Chosen):
         "zip. usd: USD with time samples. abc: Alembic. mdd: point cache for Blender, Maya and Houdini. mat: MATLAB. "
         "csv: metrics of every frame and of every point.",
     )
-    normals: Literal["static", "animated", "none"] = Field(
+    normals: Normals = Field(
         default="animated",
         description="animated: they move with the shape, in shapes.glb and in every frame of PLY, OBJ and USD. static: those of the "
         "first shape, in shapes.glb only. none: viewers compute their own.",
     )
-    colours: Literal["none", "error", "expected_error"] = Field(
+    colours: Colours = Field(
         default="none",
         description="none: no colours. error: points are coloured by their distance from the ground truth, or by their reprojection "
         "residual where there is none. expected_error: by the error that the solver expects, in percent of the object's size; only "
         "prior gaussian estimates it. PLY, OBJ and USD are coloured in every frame, shapes.glb by the mean over frames.",
     )
-    axes: Literal["tracks", "viewer"] = Field(
+    axes: Axes = Field(
         default="viewer",
         description="Axes of PLY and OBJ. viewer: y up, as in shapes.glb. tracks: those of the tracks, as in shapes.npz.",
     )
@@ -228,7 +233,7 @@ class Options(Chosen):
         description="Write shapes.glb with 16-bit positions and 8-bit normals (KHR_mesh_quantization): about half the size, and rounded "
         "to a 65,000th of the largest extent and half a degree.",
     )
-    glb_motion: Literal["auto", "frames"] = Field(
+    glb_motion: GlbMotion = Field(
         default="auto",
         description="How shapes.glb stores the motion. auto: as few modes of motion as keep every point within a thousandth "
         "of the bounding box's diagonal. frames: one morph target per frame, exact in single precision, for up to 200 frames.",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
-from pliant.schemas.options import Chosen, Options, Outputs
+from pliant.schemas.options import Axes, Chosen, Colours, GlbMotion, Normals, Options, Outputs
 from pydantic import Field
 
 
@@ -17,15 +17,11 @@ class OutputRequest(Chosen):
     fps: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] | None = Field(
         default=None, description="Frames per second of the written animation; null: as in the job."
     )
-    normals: Literal["static", "animated", "none"] | None = Field(
-        default=None, description="As in the options of a job."
-    )
-    colours: Literal["none", "error", "expected_error"] | None = Field(
-        default=None, description="As in the options of a job."
-    )
-    axes: Literal["tracks", "viewer"] | None = Field(default=None, description="As in the options of a job.")
+    normals: Normals | None = Field(default=None, description="As in the options of a job.")
+    colours: Colours | None = Field(default=None, description="As in the options of a job.")
+    axes: Axes | None = Field(default=None, description="As in the options of a job.")
     glb_quantized: bool | None = Field(default=None, description="As in the options of a job.")
-    glb_motion: Literal["auto", "frames"] | None = Field(default=None, description="As in the options of a job.")
+    glb_motion: GlbMotion | None = Field(default=None, description="As in the options of a job.")
 
     def applied_to(self, options: Options) -> Options:
         """Return the options of a job with the outputs and the overridden options of this request."""

@@ -22,7 +22,6 @@ from pliant.schemas.problems import ProblemCode, find_code
 from pliant.schemas.validation import expectation
 from pliant.worker.errors import QuotaExceeded, WorkerError
 from pliant.worker.formats import InvalidInput
-from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import BaseRoute, Match, Route
@@ -186,7 +185,7 @@ async def _of_http(request: Request, error: Exception, *, routes: Sequence[Route
 
 
 async def _of_validation(request: Request, error: Exception) -> Response:
-    assert isinstance(error, (RequestValidationError, ValidationError))
+    assert isinstance(error, RequestValidationError)
     return await _of_refusal(request, from_validation(error.errors()))
 
 

@@ -87,8 +87,6 @@ class Incoming:
     def _sweep(self) -> None:
         """Remove the sub-folders of ended processes, whose lock is free."""
         for lock in self.directory.glob("*.lock"):
-            if self._own is not None and lock.stem == self._own.name:
-                continue
             try:
                 descriptor = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
             except FileNotFoundError:  # its process has just ended normally
@@ -97,7 +95,7 @@ class Incoming:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 shutil.rmtree(lock.with_suffix(""), ignore_errors=True)
                 lock.unlink(missing_ok=True)
-            except BlockingIOError:
+            except BlockingIOError:  # its process runs, perhaps this one
                 pass
             finally:
                 os.close(descriptor)

@@ -16,8 +16,9 @@ from pliant.worker.execution.rq_worker import PliantWorker
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.logs import LogSettings, configure_logging
 from pliant.worker.maintenance.reconciler import Reconciler
+from pliant.worker.processes.containment import NUMERICAL_THREADS
 from pliant.worker.processes.preflight import check_process, open_data_directory
-from pliant.worker.settings import NUMERICAL_THREADS, Settings
+from pliant.worker.settings import Settings
 from pliant.worker.store.connection import BLOCK_WITHIN, connect, reachable
 from pliant.worker.store.outage import described
 from pliant.worker.store.queue import RedisQueue

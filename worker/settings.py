@@ -18,10 +18,6 @@ from pliant.worker.paths import socket_path
 from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
-NUMERICAL_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-"""Environment variables for the thread counts of numerical libraries. Jobs set them to 1: the solver has its own threads, and BLAS
-threads busy-wait, which slows down all processes on a loaded machine (`benchmarks/README.md`)."""
-
 
 def usable_cores(quotas: Sequence[Path] | None = None) -> int:
     """Return the number of cores this process may use, by its affinity mask and the quotas of container and systemd unit.

@@ -26,6 +26,7 @@ from pliant.solver import gallery
 from pliant.worker.errors import NotAllowedNow, StoreUnavailable
 from pliant.worker.formats import Inputs, save_inputs
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.maintenance.fsck import findings
 from pliant.worker.processes.supervisor import Supervisor, valkey_child, worker_children
 from pliant.worker.processes.valkey import Valkey
@@ -60,6 +61,7 @@ class Soak:
     jobs: Jobs
     supervisor: Supervisor
     inputs: Path
+    interpretation: Interpretation
     random: random.Random
     open: dict[str, float] = field(default_factory=dict)
     """Time of acknowledgement of each unfinished job."""
@@ -74,13 +76,9 @@ class Soak:
 
     def submit(self) -> None:
         """Submit one job; a submission refused while a store restarts is not a loss."""
-        interpretation = Interpretation(
-            num_frames=0, num_points=0, num_faces=0, hidden_fraction=0, mesh_source="given", has_ground_truth=False,
-            has_rotations=False, layout="",
-        )  # fmt: skip
         options = Options(max_reweightings=self.random.choice((2, 10, 40)), tolerance=1e-12)
         try:
-            job = self.jobs.submit(self.inputs, options=options, interpretation=interpretation)
+            job = self.jobs.submit(self.inputs, Submission(options=options), interpretation=self.interpretation)
         except StoreUnavailable:
             self.refused += 1
         else:
@@ -179,7 +177,7 @@ def main() -> int:
             has_rotations=False, layout="",
         )  # fmt: skip
         save_inputs(Inputs(sequence.tracks, sequence.mesh, None, None, interpretation), inputs)
-        soak = Soak(Jobs.open(settings), supervisor, inputs, random.Random(given.seed))
+        soak = Soak(Jobs.open(settings), supervisor, inputs, interpretation, random.Random(given.seed))
         try:
             return run(soak, given.minutes * 60, given.every)
         finally:

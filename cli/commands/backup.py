@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 
 def backup(
-    ctx: typer.Context,
     target: Annotated[
         Path, typer.Argument(help="Directory of the backup; an earlier one there is updated.", show_default=False)
     ],
@@ -26,7 +25,6 @@ def backup(
     as_json: Json = False,
 ) -> None:
     """Copy all jobs, files and tokens of an installation, which may be running, into a directory."""
-    ctx.obj.json = as_json
     require_server("pliant backup")
     from pliant.worker.maintenance.backup import write_backup
     from pliant.worker.processes.valkey import attended
@@ -44,13 +42,11 @@ def backup(
 
 
 def restore(
-    ctx: typer.Context,
     source: Annotated[Path, typer.Argument(help="Directory that `pliant backup` wrote.", show_default=False)],
     data: Data = None,
     as_json: Json = False,
 ) -> None:
     """Restore a backup into an installation without jobs and tokens; jobs that had not ended are queued again."""
-    ctx.obj.json = as_json
     require_server("pliant restore")
     from pliant.worker.maintenance.backup import read_manifest, restore_backup
     from pliant.worker.processes.valkey import attended

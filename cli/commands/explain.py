@@ -13,14 +13,12 @@ if TYPE_CHECKING:
 
 
 def explain(
-    ctx: typer.Context,
     code: Annotated[str, typer.Argument(help="Code of an error; all codes if not given.", show_default=False)] = "",
     as_json: Json = False,
 ) -> None:
     """Explain an error code: when the error occurs, and what to do. Error messages state their code."""
     from pliant.schemas.problems import ProblemCode
 
-    ctx.obj.json = as_json
     codes = [parse_code(code)] if code else list(ProblemCode)
     if as_json:
         print_json([{"code": each, **_members(each)} for each in codes])

@@ -17,7 +17,6 @@ from pliant.cli.show import err, out, print_json, show_job
 
 
 def view(
-    ctx: typer.Context,
     result: Annotated[
         Path, typer.Argument(help="Folder of a result, or a file in it.", show_default=False, readable=False)
     ],
@@ -26,7 +25,6 @@ def view(
     as_json: Json = False,
 ) -> None:
     """Show a result folder in the web viewer, without a service or a queue. Ctrl-C stops it."""
-    ctx.obj.json = as_json
     require_server("pliant view")
     import uvicorn
     from pliant.client.errors import BadArgument
@@ -68,21 +66,21 @@ def share(
     as_json: Json = False,
 ) -> None:
     """Create and print a read-only link to a finished job's result. Anyone with the link sees this result and nothing else."""
-    with ctx.obj.client(url, as_json=as_json) as client:
+    with ctx.obj.client(url) as client:
         found = find_job(client, job).id
         if revoke is not None:
             client.revoke_share(found, revoke)
             if as_json:
                 print_json({"revoked": revoke})
             else:
-                err().print(f"Revoked: {revoke}", highlight=False)
+                err().print(f"Revoked: {revoke}")
             return
         if listed:
             shares = client.shares(found)
             if as_json:
                 print_json([each.model_dump(mode="json") for each in shares])
             for each in () if as_json else shares:
-                out().print(f"{each.id}  valid until {each.expires_at:%Y-%m-%d %H:%M} UTC", highlight=False)
+                out().print(f"{each.id}  valid until {each.expires_at:%Y-%m-%d %H:%M} UTC")
             return
         made = client.share(found, days=days)
         address = f"{client.url}/{made.path}"
@@ -90,7 +88,7 @@ def share(
         print_json({**made.model_dump(mode="json"), "url": address})
     else:
         out().print(address)
-        err().print(f"Link {made.id}, valid until {made.expires_at:%Y-%m-%d %H:%M} UTC.", highlight=False)
+        err().print(f"Link {made.id}, valid until {made.expires_at:%Y-%m-%d %H:%M} UTC.")
 
 
 def rerun(
@@ -107,8 +105,8 @@ def rerun(
     start from their defaults.
     """
     options = parse_options(option)
-    with ctx.obj.client(url, as_json=as_json) as client:
+    with ctx.obj.client(url) as client:
         again = find_job(client, job).run_again(options, name=name)
         show_job(again.record, as_json=as_json)
         if not as_json:
-            err().print(f"Follow it with: pliant watch {again.id}", highlight=False)
+            err().print(f"Follow it with: pliant watch {again.id}")

@@ -52,7 +52,6 @@ def limit(help: str) -> Any:  # noqa: A002
 
 @app.command()
 def create(
-    ctx: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of its user or purpose.", show_default=False)],
     scope: Scopes = None,
     expires: Lifetime = None,
@@ -66,7 +65,6 @@ def create(
     as_json: Json = False,
 ) -> None:
     """Create a token and print it. It cannot be shown again: the service stores only its SHA-256."""
-    ctx.obj.json = as_json
     from pliant.cli.paths import input_file
     from pliant.worker.tokens import parse_duration
 
@@ -105,9 +103,8 @@ def _show_once(token: Token, text: str) -> None:
 
 
 @app.command(name="list")
-def list_tokens(ctx: typer.Context, data: Data = None, as_json: Json = False) -> None:
+def list_tokens(data: Data = None, as_json: Json = False) -> None:
     """List ids and names of the tokens, never the tokens themselves."""
-    ctx.obj.json = as_json
     with store(data) as tokens:
         found = tokens.all()
     if as_json:
@@ -157,9 +154,8 @@ def limits_of(token: Token) -> str:
 
 
 @app.command()
-def revoke(ctx: typer.Context, id: TokenId, data: Data = None, as_json: Json = False) -> None:  # noqa: A002
+def revoke(id: TokenId, data: Data = None, as_json: Json = False) -> None:  # noqa: A002
     """Revoke a token, effective from the next request. Its jobs remain visible to `admin` and to tokens that share them."""
-    ctx.obj.json = as_json
     with store(data) as tokens:
         token = tokens.revoke(id)
     if as_json:

@@ -39,8 +39,7 @@ def top(
     as_json: Json = False,
 ) -> None:
     """Show running, queued and recent jobs, and the state of every component of the service. Ctrl-C stops it."""
-    ctx.obj.json = as_json
-    with ctx.obj.client(url, as_json=as_json) as client:
+    with ctx.obj.client(url) as client:
         if as_json:
             view = read_view(client)
             print_json({**asdict(view), "jobs": [job.model_dump(mode="json") for job in view.jobs]})

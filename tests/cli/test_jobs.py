@@ -248,8 +248,8 @@ def test_a_failed_job_ends_with_exit_code_1_and_its_message(tracks: Path) -> Non
 class Impatient(Session):
     """Gives up on a service that never answered after a fraction of the usual five seconds."""
 
-    def client(self, url: str, *, as_json: bool, first_contact: float | None = None) -> Client:
-        return super().client(url, as_json=as_json, first_contact=0.3)
+    def client(self, url: str, *, first_contact: float | None = None) -> Client:
+        return super().client(url, first_contact=0.3)
 
 
 def test_timeouts_and_unreachable_services_have_exit_codes(tracks: Path) -> None:

@@ -30,8 +30,9 @@ from pliant.service.settings import ServiceSettings
 from pliant.service.testing import InMemoryService
 from pliant.solver.gallery import face
 from pliant.worker.errors import ServerFailed, StoreUnavailable
+from pliant.worker.processes.containment import NUMERICAL_THREADS
 from pliant.worker.processes.valkey import find_binary
-from pliant.worker.settings import NUMERICAL_THREADS, Settings
+from pliant.worker.settings import Settings
 from serving import free_port, until
 from typer.testing import CliRunner
 

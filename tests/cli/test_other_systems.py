@@ -1,4 +1,4 @@
-"""The SDK and `pliant solve` of an npz file work without the modules of Linux and macOS, as on Windows; commands without the extras."""
+"""The SDK and `pliant solve` of an npz file work without what only Linux and macOS have, as on Windows; commands without the extras."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 WITHOUT = """
-import sys
+import asyncio, os, signal, subprocess, sys, tempfile  # first: the standard library asks which system this is
 for name in ("resource", "fcntl", "pwd", "grp", "termios"):
     sys.modules[name] = None
+for module, names in ((signal, "SIGHUP SIGKILL SIGXCPU"), (os, "EX_TEMPFAIL fork getuid killpg sched_getaffinity sysconf wait4")):
+    for name in names.split():
+        vars(module).pop(name, None)
 """
 IMPORTS = """
 import pliant

@@ -26,7 +26,7 @@ from pliant.client import BadArgument
 from pliant.schemas.problems import ProblemCode
 from pliant.service.testing import InMemoryService
 from pliant.worker.errors import TimedOut
-from pliant.worker.settings import NUMERICAL_THREADS
+from pliant.worker.processes.containment import NUMERICAL_THREADS
 from serving import until
 from typer.testing import CliRunner, Result
 
@@ -371,6 +371,17 @@ def test_server_commands_say_what_to_install(
         f"{name} needs the service, which is not installed: pip install '.[server]' in Pliant's source folder",
         "missing_extra",
     )
+
+
+@pytest.mark.parametrize("absent", ["prometheus_client", "pythonjsonlogger"])
+def test_server_commands_need_every_module_that_the_service_imports(
+    absent: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, absent, None)
+    ran = CliRunner().invoke(app, ["up"])
+    assert ran.exit_code == Exit.UNHEALTHY
+    assert "pliant up needs the service, which is not installed" in words(ran)
 
 
 @pytest.mark.parametrize(

@@ -503,7 +503,8 @@ def test_stopping_kills_the_film_process(film: Path, tmp_path: Path) -> None:
 def tracks_file(path: Path, **more: np.ndarray) -> Path:
     points = np.random.default_rng(0).uniform(0, 50, (4, 9, 2)).astype(np.float32)
     arrays = {"tracks": points, "visibility": np.ones((4, 9), bool), "confidence": np.full((4, 9), 0.5, np.float32),
-              "grid": np.arange(9, dtype=np.int32).reshape(3, 3), "frame_times": np.arange(4.0)}  # fmt: skip
+              "grid": np.arange(9, dtype=np.int32).reshape(3, 3), "frame_times": np.arange(4.0),
+              "image_size": np.array([64, 48]), "fps": np.array(30.0)}  # fmt: skip
     np.savez(path, **(arrays | more))
     return path
 
@@ -521,7 +522,7 @@ def test_tracker_confidence_becomes_the_observation_weight(tmp_path: Path) -> No
     fewer = read_tracked(tmp_path / "a.npz", tracked, Options(stride=2))
     assert fewer.selection is not None
     assert fewer.tracks.num_points == 4
-    with pytest.raises(InvalidInput, match="without confidence, grid or times"):
+    with pytest.raises(InvalidInput, match="confidence of shape"):
         read_tracked(tracks_file(tmp_path / "b.npz", confidence=np.ones((3, 9))), tracked, Options())
 
 

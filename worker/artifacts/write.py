@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -57,19 +59,9 @@ def write_kinds(
     entries: dict[str, Any] = {}
     done, total = 0.0, sum(kind.share for kind in kinds)
     for kind in kinds:
-        start, share = done / total, kind.share / total
-        extra: dict[str, Any] = {}
-
-        def put(
-            file: IO[bytes],
-            kind: Kind = kind,
-            start: float = start,
-            share: float = share,
-            extra: dict[str, Any] = extra,
-        ) -> None:
-            extra.update(kind.write(result, file, lambda part: on_progress(start + share * part)))
-
-        artifact = _written(directory, kind.name, kind.media_type, kind.description, put)
+        with _complete(directory / kind.name) as file:
+            extra = kind.write(result, file, partial(_report_share, on_progress, done / total, kind.share / total))
+        artifact = described(directory / kind.name, kind.media_type, kind.description)
         written.append(artifact)
         entries[kind.name] = {"bytes": artifact.bytes, "sha256": artifact.sha256, **extra}
         done += kind.share
@@ -79,20 +71,25 @@ def write_kinds(
 def write_report(report: dict[str, Any], directory: Path) -> Artifact:
     """Write `report.json` and return its record."""
     text = json.dumps(report, indent=2, allow_nan=False).encode()
-    return _written(directory, "report.json", "application/json", REPORT, lambda file: file.write(text))
+    with _complete(directory / "report.json") as file:
+        file.write(text)
+    return described(directory / "report.json", "application/json", REPORT)
 
 
-def _written(
-    directory: Path, name: str, media_type: str, description: str, put: Callable[[IO[bytes]], object]
-) -> Artifact:
-    aside = directory / f".{name}.part"
+@contextmanager
+def _complete(target: Path) -> Iterator[IO[bytes]]:
+    """Open a temporary file for writing, and rename it to `target` at the end; after an error, `target` is unchanged."""
+    aside = target.with_name(f".{target.name}.part")
     try:
         with aside.open("wb") as file:
-            put(file)
-        aside.replace(directory / name)
+            yield file
+        aside.replace(target)
     finally:
         aside.unlink(missing_ok=True)
-    return described(directory / name, media_type, description)
+
+
+def _report_share(on_progress: OnProgress, start: float, share: float, part: float) -> None:
+    on_progress(start + share * part)
 
 
 def described(file: Path, media_type: str, description: str) -> Artifact:

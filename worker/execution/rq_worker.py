@@ -169,12 +169,12 @@ class PliantWorker(Worker):
         except AWAY as error:
             if self.horse_pid:
                 raise
-            id = str((*job.args, "")[0])
+            id, _ = _ids_of(job)
             logger.warning("job %s: delivery %s: %s", id, job.id, error, extra={"job": id})
 
     def _leave_to_a_larger(self, job: RqJob) -> bool:
         """Requeue a job that needs more memory than this worker has, if another worker has enough; return True if it was requeued."""
-        id, attempt_id = (str(each) for each in (*job.args, "", "")[:2])
+        id, attempt_id = _ids_of(job)
         try:
             held = self._records.get(id)
             estimate = held.job.interpretation.estimate
@@ -210,7 +210,7 @@ class PliantWorker(Worker):
 
     def main_work_horse(self, job: RqJob, queue: RqQueue) -> None:
         """Run the delivery in the job process, which ends with the worker."""
-        die_with_parent(int(os.environ["PLIANT_WORKER_PROCESS"]))
+        die_with_parent(int(os.environ["PLIANT_WORKER_PROCESS"]), how=signal.SIGKILL)
         job.settings = self._settings  # type: ignore[attr-defined]
         super().main_work_horse(job, queue)
 
@@ -226,7 +226,7 @@ class PliantWorker(Worker):
 
     def monitor_work_horse(self, job: RqJob, queue: RqQueue) -> None:  # noqa: ARG002
         """Wait for the job process, record the outcome, clean up."""
-        id, attempt_id = (str(each) for each in (*job.args, "", "")[:2])
+        id, attempt_id = _ids_of(job)
         watch = Watch(self._settings, self._records, id=id, attempt_id=attempt_id, worker=self.name)
         next_sign = time.monotonic() + IDLE_WAKE
         while True:
@@ -275,3 +275,9 @@ class PliantWorker(Worker):
         except UnknownJob:
             return False
         return held.attempt_id == watch.attempt_id and held.worker != watch.worker and held.job.status in ACTIVE
+
+
+def _ids_of(delivery: RqJob) -> tuple[str, str]:
+    """Return the ids of job and attempt that a delivery carries; empty for what it lacks, as only a foreign one does."""
+    id, attempt_id = (str(each) for each in (*delivery.args, "", "")[:2])
+    return id, attempt_id

@@ -7,21 +7,16 @@ from pathlib import Path
 import numpy as np
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
-from pliant.solver import Mesh, Tracks
+from pliant.solver import Tracks
 from pliant.worker.films.tracker import Tracked, notes_on_rate
 from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.errors import damaged
 from pliant.worker.formats.reading.arrays import read_file
 from pliant.worker.formats.records import Inputs, Limits, Selection
-from pliant.worker.formats.texture import Texture
 from pliant.worker.formats.tracks.decimation import thin
-from pliant.worker.formats.tracks.frame_times import ARRAY as TIMES
-from pliant.worker.formats.tracks.frame_times import read_frame_times
+from pliant.worker.formats.tracks.film_tracks import read_film_tracks
 from pliant.worker.formats.tracks.selection import LEFT_OUT_LISTED, hide_sparsely_observed
 from pliant.worker.formats.unused_options import notes_on_options
-
-REQUIRED = frozenset(("tracks", "visibility", "confidence", "grid", TIMES))
-TEXTURE_ARRAYS = frozenset(("template_image", "uv"))
 
 
 def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
@@ -34,14 +29,16 @@ def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
     InvalidInput
         The arrays do not fit together, or `stride`, `max_points` or `min_seen` leave too few points.
     """
-    arrays = read_file(file, field="film", limits=Limits(), wanted=REQUIRED | TEXTURE_ARRAYS)
-    if not set(arrays) >= REQUIRED or arrays["tracks"].shape[:2] != arrays["confidence"].shape:
-        raise damaged("film", "tracks without confidence, grid or times")
-    points = arrays["tracks"].astype(np.float64)
-    visible = np.where(arrays["visibility"].astype(bool), arrays["confidence"], 0).astype(np.float64)
-    given = points.shape[1]
-    kept, mesh, how = thin(points, visible, Mesh.from_grid(arrays["grid"]), options)
-    points, visible = points[:, kept], visible[:, kept]
+    limits = Limits()
+    tracks = read_file(file, field="film", limits=limits, wanted=("tracks",)).get("tracks")
+    if tracks is None or tracks.ndim != 3:
+        raise damaged("film", "a film without tracks (F, P, 2)")
+    film = read_film_tracks(file, field="film", shape=tracks.shape[:2], limits=limits)
+    if film.times is None:
+        raise damaged("film", "tracks of a film without times")
+    given = tracks.shape[1]
+    kept, mesh, how = thin(tracks, film.visible, film.mesh, options)
+    points, visible = tracks[:, kept].astype(np.float64), film.visible[:, kept]
     confidence, left_out, sparse = hide_sparsely_observed(points, visible, mesh, options)
     checked = Tracks.from_arrays(points, confidence)
     hidden = float((checked.visible == 0).mean())
@@ -58,10 +55,6 @@ def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
     )  # fmt: skip
     frames = np.arange(checked.num_frames)
     selection = Selection(frames, kept, (len(frames), given))
-    texture = None
-    if set(arrays) >= TEXTURE_ARRAYS:
-        texture = Texture.from_tracked(arrays["template_image"], np.clip(arrays["uv"], 0, 1)).at_points(kept)
-    times = read_frame_times(arrays, checked.num_frames, field="film")
     return Inputs(
         checked,
         mesh,
@@ -69,7 +62,7 @@ def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
         None,
         stated,
         selection if selection.narrows else None,
-        texture=texture,
-        frame_times=times,
+        texture=None if film.texture is None else film.texture.at_points(kept),
+        frame_times=film.times,
         warnings=tracked.warnings,
     )

@@ -46,7 +46,7 @@ def one_line(text: str) -> str:
     return " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
 
 
-def found(names: Sequence[str]) -> dict[str, NDArray[np.generic]]:
+def names_array(names: Sequence[str]) -> dict[str, NDArray[np.generic]]:
     """Return the names in a file as a named array; nothing if every name is blank or a number."""
     lines = [_clean(name) for name in names]
     return {} if all(line == "" or line.isdecimal() for line in lines) else {ARRAY: pack(lines)}

@@ -62,7 +62,7 @@ def read_inputs(
     understood = understand(read_arrays(tracks, field="tracks", limits=limits, wanted=KNOWN), options, file=tracks)
     film: FilmTracks | None = None
     if understood.format == OWN:
-        film = read_film_tracks(tracks, shape=understood.points.shape[:2], limits=limits)
+        film = read_film_tracks(tracks, field="tracks", shape=understood.points.shape[:2], limits=limits)
         understood = replace(understood, visible=film.visible)
     chosen = _choose(understood, mesh, options, limits, film)
     truth, truth_notes = _read_truth(ground_truth, understood, chosen.selection, limits)

@@ -17,7 +17,7 @@ import json
 import os
 import re
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -234,19 +234,15 @@ def _lines(records: Path) -> Iterator[str]:
 
 def _prune(target: Path, manifest: dict[str, Any]) -> None:
     """Remove files that only an earlier backup uses."""
-    _remove(target, lambda path: path.name.startswith(("jobs-", "rest-")) and path.name not in manifest["files"])
+    for path in target.iterdir():
+        if path.name.startswith(("jobs-", "rest-")) and path.name not in manifest["files"]:
+            path.unlink()
     blobs = target / "blobs"
     for path in sorted(blobs.rglob("*"), reverse=True):  # files before their folders
         if path.is_file() and path.relative_to(blobs).as_posix() not in manifest["blobs"]:
             path.unlink()
         elif path.is_dir() and not any(path.iterdir()):
             path.rmdir()
-
-
-def _remove(folder: Path, unwanted: Callable[[Path], bool]) -> None:
-    for path in folder.iterdir():
-        if path.is_file() and unwanted(path):
-            path.unlink()
 
 
 def _sha256(file: Path) -> str:

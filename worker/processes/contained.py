@@ -12,6 +12,7 @@ import errno
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
 import tempfile
@@ -22,7 +23,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pliant.schemas.invalid import Invalid, members_of
-from pliant.worker.processes.containment import die_with_parent
+from pliant.worker.processes.containment import NUMERICAL_THREADS, die_with_parent
 
 DONE, REFUSED, DISK_FULL = 0, 3, 4
 """Exit codes of a process that succeeded, of one that rejected its input, and of one that found the disk full."""
@@ -80,7 +81,7 @@ def run_contained(
     OSError
         ENOSPC: the disk is full, here or for the process.
     """
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    threads = dict.fromkeys(NUMERICAL_THREADS, "1")
     with (
         _Progress(on_line) as progress,
         tempfile.TemporaryFile() as given,
@@ -173,7 +174,7 @@ class _Progress:
 
 def serve(handle: Callable[[dict[str, Any]], str]) -> int:
     """Run as the contained process: read the request, call `handle`, write its answer or error; return the exit code."""
-    die_with_parent(int(sys.argv[1]))
+    die_with_parent(int(sys.argv[1]), how=signal.SIGKILL)
     try:
         try:
             answer, code = handle(json.load(sys.stdin)), DONE

@@ -1,4 +1,4 @@
-"""Operating system interfaces: ending with the parent process, and detecting the out-of-memory killer."""
+"""What contains a process: the number of its threads, its end with the parent process, and the out-of-memory killer."""
 
 from __future__ import annotations
 
@@ -11,11 +11,15 @@ from pathlib import Path
 
 from pliant.worker.control_group import group_files
 
+NUMERICAL_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+"""Environment variables for the thread counts of numerical libraries. Jobs set them to 1: the solver has its own threads, and BLAS
+threads busy-wait, which slows down all processes on a loaded machine (`benchmarks/README.md`)."""
+
 _PR_SET_PDEATHSIG = 1
 _libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
 
-def die_with_parent(parent: int, *, how: signal.Signals = signal.SIGKILL) -> None:
+def die_with_parent(parent: int, *, how: signal.Signals) -> None:
     """Make the kernel signal this process when its parent ends (Linux; elsewhere a job process polls its parent's id).
 
     `parent` is the parent's process id, taken before the fork, because the parent may already have ended.

@@ -15,9 +15,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import FrameType
 
-from pliant.worker.processes.containment import die_with_parent
+from pliant.worker.processes.containment import NUMERICAL_THREADS, die_with_parent
 from pliant.worker.processes.valkey import Valkey
-from pliant.worker.settings import NUMERICAL_THREADS, Settings
+from pliant.worker.settings import Settings
 
 logger = logging.getLogger(__name__)
 

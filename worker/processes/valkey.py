@@ -86,7 +86,6 @@ class Valkey:
         binary = find_binary()
         home, path = valkey_directory(data), socket_path(data)
         make_data_directory(data)
-        home.mkdir(parents=True, exist_ok=True, mode=0o700)
         supervisor_lock = os.open(home / "supervisor.lock", os.O_RDWR | os.O_CREAT, 0o600)
         if not _lock(supervisor_lock):
             holder = os.read(supervisor_lock, 20).decode(errors="replace").strip()

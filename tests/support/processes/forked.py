@@ -213,6 +213,6 @@ def forked_by_a_fork(command: list[str], **given: Unpack[Streams]) -> Grandchild
 
 
 if __name__ == "__main__":
-    die_with_parent(int(sys.argv[2]))
+    die_with_parent(int(sys.argv[2]), how=signal.SIGKILL)
     with socket.socket(fileno=int(sys.argv[1])) as control:
         served(control)

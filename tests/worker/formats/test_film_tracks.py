@@ -124,9 +124,12 @@ def test_selected_frames_keep_their_times_and_have_their_own_mean_rate(tmp_path:
     assert (inputs.frame_times, inputs.interpretation.fps) == (None, 12.0)
 
 
-def test_a_film_process_that_leaves_out_the_times_is_not_believed(tmp_path: Path) -> None:
-    file = film_file(tmp_path / "tracks.npz", frame_times=None)
-    with pytest.raises(InvalidInput, match="without confidence, grid or times"):
+@pytest.mark.parametrize(("left_out", "words"), [("frame_times", "without times"), ("tracks", "without tracks")])
+def test_a_film_process_that_leaves_out_times_or_tracks_is_not_believed(
+    left_out: str, words: str, tmp_path: Path
+) -> None:
+    file = film_file(tmp_path / "tracks.npz", **{left_out: None})
+    with pytest.raises(InvalidInput, match=f"film: .* {words}"):
         read_tracked(file, Tracked(container="mp4", fps=30.0, warnings=()), Options())
 
 

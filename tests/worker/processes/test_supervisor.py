@@ -244,7 +244,10 @@ def test_children_end_with_a_killed_supervisor() -> None:
 
 
 def test_an_already_ended_parent_is_detected() -> None:
-    code = f"from pliant.worker.processes.containment import die_with_parent; die_with_parent({os.getpid() + 10**6}); print('alive')"
+    code = (
+        "import signal; from pliant.worker.processes.containment import die_with_parent; "
+        f"die_with_parent({os.getpid() + 10**6}, how=signal.SIGKILL); print('alive')"
+    )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert (ran.returncode, ran.stdout) == (-signal.SIGKILL, b"")
 

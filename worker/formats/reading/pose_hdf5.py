@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import damaged
-from pliant.worker.formats.point_names import found
+from pliant.worker.formats.point_names import names_array
 from pliant.worker.formats.reading.hdf5 import UNREADABLE, check_before_reading, read_arrays, read_values
 from pliant.worker.formats.records import Arrays, Limits
 
@@ -62,7 +62,7 @@ def _sleap(file: h5py.File, field: str, limits: Limits) -> Arrays | None:
         whose = animals if len(animals) == instances else [str(index) for index in range(instances)]
         names = [f"{animal}/{part}" for animal in whose for part in parts]
     points = values.transpose(0, 3, 1, 2).reshape(frames, instances * nodes, 2)
-    return {"sleap": points, **found(names)}
+    return {"sleap": points, **names_array(names)}
 
 
 def _deeplabcut(file: h5py.File, field: str, limits: Limits) -> Arrays | None:
@@ -99,7 +99,7 @@ def _columns(values: NDArray[np.float64], field: str, heads: list[tuple[str, ...
     points = np.stack([values[:, 0::3], values[:, 1::3]], axis=2)
     known = [head[-1] for head in heads] == ["x", "y", "likelihood"] * points.shape[1]
     names = ["/".join(head[1:-1]) for head in heads[::3]] if known else []
-    return {"deeplabcut": points, "likelihood": likelihood, **found(names)}
+    return {"deeplabcut": points, "likelihood": likelihood, **names_array(names)}
 
 
 def _levels(group: h5py.Group, field: str, limits: Limits) -> list[tuple[str, ...]]:

@@ -13,8 +13,7 @@ from typing import IO, Any
 import numpy as np
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import too_large
-from pliant.worker.formats.point_names import MEDIAPIPE
-from pliant.worker.formats.point_names import found as found_names
+from pliant.worker.formats.point_names import MEDIAPIPE, names_array
 from pliant.worker.formats.records import Arrays, Limits
 
 MOST_BYTES = 64 << 20
@@ -68,7 +67,7 @@ def read_landmarks(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
             if values is None:
                 raise _unreadable(field, f"landmark {place} of frame {number}: {json.dumps(landmark)[:80]}")
             points[number, place], sure[number, place] = values[:2], values[2]
-    return {"mediapipe": points, "likelihood": sure, **found_names(_names(next(frame for frame in frames if frame)))}
+    return {"mediapipe": points, "likelihood": sure, **names_array(_names(next(frame for frame in frames if frame)))}
 
 
 def _names(landmarks: list[Any]) -> list[str]:

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import too_large
-from pliant.worker.formats.point_names import MEDIAPIPE
-from pliant.worker.formats.point_names import found as found_names
+from pliant.worker.formats.point_names import MEDIAPIPE, names_array
 from pliant.worker.formats.records import Arrays, Limits
 
 SEPARATORS = "\t;,"
@@ -190,7 +189,7 @@ def read_rows(
         found["likelihood"] = np.ones((count, points))
         found["likelihood"][:, list(seen)] = table[:, 2 * points :]
         found["likelihood"][np.setdiff1d(np.arange(count), places)] = 0.0
-    return {**found, **found_names(columns.names)}
+    return {**found, **names_array(columns.names)}
 
 
 def check_full_table(field: str, shape: tuple[int, int], *, size: int, rows: int, limits: Limits) -> None:

@@ -59,8 +59,8 @@ class FilmTracks:
         return min(mean_rate(self.times[frames]), MAX_RATE)
 
 
-def read_film_tracks(path: Path, *, shape: tuple[int, int], limits: Limits) -> FilmTracks:
-    """Read the contents of a file of `pliant track` besides its tracks; `shape` is frames and points.
+def read_film_tracks(path: Path, *, field: str, shape: tuple[int, int], limits: Limits) -> FilmTracks:
+    """Read the contents of a file of `pliant track` besides its tracks; `field` is the input that holds it, `shape` frames and points.
 
     Raises
     ------
@@ -68,26 +68,26 @@ def read_film_tracks(path: Path, *, shape: tuple[int, int], limits: Limits) -> F
         Code damaged_file if an array is missing or does not fit the tracks, and the codes of `read_arrays` and `Mesh`.
     """
     arrays = read_arrays(
-        path, field="tracks", limits=limits, wanted=frozenset((*REQUIRED, TIMES, WARNINGS, *TEXTURE_ARRAYS))
+        path, field=field, limits=limits, wanted=frozenset((*REQUIRED, TIMES, WARNINGS, *TEXTURE_ARRAYS))
     )
     missing = [name for name in REQUIRED if name not in arrays]
     if missing:
-        raise damaged("tracks", f"tracks of a film without {', '.join(missing)}")
+        raise damaged(field, f"tracks of a film without {', '.join(missing)}")
     for name in ("visibility", "confidence"):
         if arrays[name].shape != shape or arrays[name].dtype.kind not in "bfiu":
-            raise damaged("tracks", f"{name} of shape {arrays[name].shape} beside tracks of shape {(*shape, 2)}")
+            raise damaged(field, f"{name} of shape {arrays[name].shape} beside tracks of shape {(*shape, 2)}")
     confidence = np.asarray(arrays["confidence"], dtype=np.float64)
     if not ((confidence >= 0) & (confidence <= 1)).all():
-        raise damaged("tracks", "confidence outside 0 … 1")
+        raise damaged(field, "confidence outside 0 … 1")
     mesh = Mesh.from_grid(arrays["grid"])
     if mesh.num_points != shape[1]:
-        raise damaged("tracks", f"a grid of {mesh.num_points} points beside tracks of {shape[1]}")
-    size, fps = _shot(arrays)
+        raise damaged(field, f"a grid of {mesh.num_points} points beside tracks of {shape[1]}")
+    size, fps = _shot(arrays, field)
     texture = None
     if all(name in arrays for name in TEXTURE_ARRAYS):
-        texture = _texture(arrays, shape[1])
+        texture = _texture(arrays, shape[1], field)
     visible = np.where(arrays["visibility"].astype(bool), confidence, 0.0)
-    times, warnings = read_frame_times(arrays, shape[0], field="tracks"), read_warnings(arrays, field="tracks")
+    times, warnings = read_frame_times(arrays, shape[0], field=field), read_warnings(arrays, field=field)
     return FilmTracks(visible, mesh, size, fps, times, texture, warnings)
 
 
@@ -101,21 +101,21 @@ def tracks_options(options: Options, interpretation: Interpretation) -> Options:
     return options.model_copy(update=stated) if stated else options
 
 
-def _shot(arrays: Arrays) -> tuple[tuple[int, int], float]:
+def _shot(arrays: Arrays, field: str) -> tuple[tuple[int, int], float]:
     size, rate = arrays["image_size"], arrays["fps"]
     if size.shape != (2,) or size.dtype.kind not in "iu" or not ((size > 0) & (size <= MAX_PICTURE_SIDE)).all():  # type: ignore[operator]
-        raise damaged("tracks", "an image_size that is not two positive integers, width and height")
+        raise damaged(field, "an image_size that is not two positive integers, width and height")
     fps = float(rate) if rate.shape == () and rate.dtype.kind in "fiu" else np.nan
     if not 0 < fps <= MAX_RATE:
-        raise damaged("tracks", f"an fps that is not a number from 0 to {MAX_RATE:g}")
+        raise damaged(field, f"an fps that is not a number from 0 to {MAX_RATE:g}")
     return (int(size[0]), int(size[1])), fps
 
 
-def _texture(arrays: Arrays, num_points: int) -> Texture:
+def _texture(arrays: Arrays, num_points: int, field: str) -> Texture:
     places = arrays["uv"]
     if places.shape != (num_points, 2) or places.dtype.kind != "f" or not np.isfinite(places).all():
-        raise damaged("tracks", f"texture coordinates of shape {places.shape} for {num_points} points")
+        raise damaged(field, f"texture coordinates of shape {places.shape} for {num_points} points")
     try:
         return Texture.from_tracked(arrays["template_image"], np.clip(places, 0, 1))
     except InvalidInput as error:
-        raise damaged("tracks", f"a template_image that is no picture ({error.got})") from error
+        raise damaged(field, f"a template_image that is no picture ({error.got})") from error
