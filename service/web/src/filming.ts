@@ -43,8 +43,9 @@ export class Filming {
   private drawn: Drawn | null = null;
   /** A mask picture instead of a drawn region; null for the picture if the browser cannot decode it. */
   private masking: { file: File; picture: ImageBitmap | null } | null = null;
-  /** Number of frames according to the service; 0: unknown. */
-  private frames = 0;
+  /** Number of frames according to the service, once it has read the film; 0: unknown. */
+  private frames = Promise.resolve(0);
+  private tellFrames: (frames: number) => void = () => undefined;
   /** Whether the browser gave up decoding the film. */
   private undecoded = false;
   private shown: Promise<void> = Promise.resolve();
@@ -111,7 +112,9 @@ export class Filming {
 
   /** Take the number of frames according to the service. */
   count(film: File, frames: number): void {
-    if (this.film === film) this.frames = frames;
+    if (this.film !== film) return;
+    this.tellFrames(frames); // a dialog that is open already
+    this.frames = Promise.resolve(frames);
   }
 
   private async begin(film: File | null): Promise<void> {
@@ -120,7 +123,7 @@ export class Filming {
     this.served?.close();
     this.release();
     this.picture = this.served = null;
-    this.frames = 0;
+    this.frames = new Promise((resolve) => (this.tellFrames = resolve));
     this.undecoded = false;
     this.element.hidden = film === null;
     this.write(film ? "Reading the first frame…" : "");

@@ -18,12 +18,12 @@ const SAMPLES = [0.25, 0.37, 0.5, 0.62, 0.8];
 /** Maximum distance from the even spacing, in frames; the times in a file are rounded to milliseconds. */
 const TOLERANCE = 0.2;
 
-/** Return the frames of a film, or null if only its first one can be chosen. `stated` is their number according to the service; 0: unknown. */
-export async function openFrames(film: File, stated: number): Promise<Frames | null> {
+/** Return the frames of a film, or null if only its first one can be chosen. `counted` is their number according to the service; 0: unknown. */
+export async function openFrames(film: File, counted: Promise<number>): Promise<Frames | null> {
   try {
     if (/\.gif$/i.test(film.name)) return await ofAnimation(film);
     if (/\.zip$/i.test(film.name)) return await ofPictures(film);
-    return await ofVideo(film, stated);
+    return await ofVideo(film, await counted);
   } catch (error) {
     if (unreadable(error)) return null;
     throw error;

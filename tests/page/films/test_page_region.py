@@ -20,7 +20,7 @@ from filming import (
     sent_options,
 )
 from paging import BOTH_WIDTHS_AND_THEMES, drop, until
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 pytestmark = [
     pytest.mark.chromium,
@@ -227,6 +227,24 @@ def test_a_region_is_drawn_on_another_frame(
     expect(filming.get_by_text("Tracking the film")).to_be_visible()
     assert sent_options(filming)["region_frame"] == 3
     assert len(sent_options(filming)["region_polygon"]) > 3
+
+
+def test_frames_can_be_chosen_once_the_service_has_counted_them(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
+    """An upload from a phone takes longer than opening the dialog."""
+    seen = {**film_record(url, finished)["interpretation"], "given_frames": 6, "sample": []}
+    asked: list[Route] = []
+    filming.route("**/v1/inspect", lambda route: asked.append(route))
+    drop(filming, {"film.webm": films["film.webm"]})
+    filming.get_by_role("button", name="Draw a region").click()
+    slider = filming.get_by_role("slider", name="Frame to draw on")
+    filming.wait_for_timeout(300)
+    expect(slider).to_be_hidden()
+    while not asked:
+        filming.wait_for_timeout(50)
+    asked[0].fulfill(json=seen)
+    expect(slider).to_have_attribute("max", "5")
 
 
 @pytest.mark.parametrize(
