@@ -137,11 +137,11 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
     search = begun
     tried = _downhill(search, [first], ends, sides=(-1,))
     for _ in range(ROUNDS):
-        search, along = _along_surface(search, tried)
-        if not along:
-            break
-        tried = _downhill(search, along, ends)
-    if not given and _may_be_accepted(tried):
+        along_surface, refined = _along_surface(search, tried)
+        if refined:
+            search, tried = along_surface, refined
+        tried = _downhill(search, tried, ends)
+    if not given and _may_be_accepted(tried, ends):
         tried += _golden(search, least_of(tried))
         tried += _beside(
             search, tried, least_of(tried)
@@ -189,12 +189,17 @@ def _along_surface(search: FocalSearch, tried: list[Tried]) -> tuple[FocalSearch
     return search, [each for each in refined if not _stretched(each.graph, each.found)]
 
 
-def _may_be_accepted(tried: list[Tried]) -> bool:
-    """Whether `judged` could accept a minimum within one step of the least I: none of the neighbours it will have is below `RISE`."""
+def _may_be_accepted(tried: list[Tried], ends: tuple[float, float]) -> bool:
+    """Whether `judged` could accept a minimum within one step of the least I: none of the neighbours it will have is below `RISE`.
+
+    Between the ends of the search, its neighbours have been tried: one that is missing is stretched, and nothing can be accepted.
+    """
     least = least_of(tried)
     values = [each.found.inconsistency for each in tried]
-    apart = [t for t in tried if abs(np.log(t.focal / least.focal)) >= 1.9 * np.log(FOCAL_STEP)]
-    return max(values) - min(values) >= RISE and all(each.found.inconsistency >= RISE for each in apart)
+    steps = np.log([each.focal / least.focal for each in tried]) / np.log(FOCAL_STEP)
+    bracketed = bool(steps.min() <= -0.9 and steps.max() >= 0.9) or not ends[0] <= least.focal <= ends[1]
+    apart = [value for value, step in zip(values, steps, strict=True) if abs(step) >= 1.9]
+    return bracketed and max(values) - min(values) >= RISE and min(apart, default=RISE) >= RISE
 
 
 def least_of(tried: list[Tried]) -> Tried:
