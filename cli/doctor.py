@@ -159,13 +159,13 @@ def check_packages(version_of: Callable[[str], str] = version) -> Iterator[Findi
 def check_films() -> Iterator[Finding]:
     """Check that OpenCV can be imported and decodes films."""
     try:
-        import cv2
+        from pliant.tracking.decoding.film import decoder
     except ImportError as fault:
         advice = "Only films need it: pip install '.[film]' in Pliant's source folder"
         yield Finding("films", "note", f"OpenCV cannot be imported: {fault}", advice)
         return
-    found = f"OpenCV {cv2.__version__}"
-    if cv2.CAP_FFMPEG in cv2.videoio_registry.getStreamBackends():
+    found, has_ffmpeg = decoder()
+    if has_ffmpeg:
         yield Finding("films", "good", found)
     else:
         advice = "It cannot decode films. Install the one from PyPI: pip install opencv-python-headless"

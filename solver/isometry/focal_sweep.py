@@ -122,7 +122,8 @@ class Tried:
 def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) -> list[Tried]:
     """Return the isometries tried: downhill from the first focal length by `FOCAL_STEP`, at most one step beyond `FOCAL_RANGE`.
 
-    If the surface is stretched at the first focal length, which may be far too long, the search starts with the next shorter ones.
+    A given focal length is tried first and kept. Others are left out if the surface is stretched there: the search starts with the next
+    shorter ones, since the first may be far too long.
 
     Distances between the ends of edges vary where the surface bends. They make focal lengths that are too long more consistent, since the
     surface bends less there, so lengths along the surface are needed before longer ones are tried. Unless `given`, the bracket of the
@@ -138,8 +139,9 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
     tried = _downhill(search, [first], ends, sides=(-1,))
     for _ in range(ROUNDS):
         along_surface, refined = _along_surface(search, tried)
-        if refined:
-            search, tried = along_surface, refined
+        kept = [each for each in refined if (given and each.focal == focal) or not _stretched(each.graph, each.found)]
+        if kept:
+            search, tried = along_surface, kept
         tried = _downhill(search, tried, ends)
     if not given and _may_be_accepted(tried, ends):
         tried += _golden(search, least_of(tried))
@@ -175,18 +177,17 @@ def _downhill(
 
 
 def _along_surface(search: FocalSearch, tried: list[Tried]) -> tuple[FocalSearch, list[Tried]]:
-    """Return the search and the isometries tried, with lengths along the surface that has the least I, without stretched surfaces.
+    """Return the search and the isometries tried, with lengths along the surface that has the least I.
 
-    All focal lengths share these lengths: their own would make a surface that is stretched along the viewing rays consistent.
+    All focal lengths share them: their own would make a surface that is stretched along the viewing rays consistent.
     """
     least = least_of(tried)
     search = replace(search, arc_ratios=arc_chord_ratios(least.graph, least.found))
     graphs = [search.solved(each.focal) for each in tried]
-    refined = [
+    return search, [
         Tried(each.focal, graph, refine(graph, each.found.depths, should_stop=search.should_stop))
         for each, graph in zip(tried, graphs, strict=True)
     ]
-    return search, [each for each in refined if not _stretched(each.graph, each.found)]
 
 
 def _may_be_accepted(tried: list[Tried], ends: tuple[float, float]) -> bool:

@@ -392,6 +392,7 @@ def test_doctor_checks_that_films_can_be_decoded(monkeypatch: pytest.MonkeyPatch
     assert without.verdict == "note"
     assert without.found.endswith("built without FFmpeg")
     monkeypatch.setitem(sys.modules, "cv2", None)
+    monkeypatch.delitem(sys.modules, "pliant.tracking.decoding.film")
     (absent,) = doctor.check_films()
     assert absent.verdict == "note"
     assert "pip install '.[film]'" in absent.advice

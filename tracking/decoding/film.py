@@ -57,6 +57,11 @@ FFMPEG = {
 _OPENING = threading.Lock()
 
 
+def decoder() -> tuple[str, bool]:
+    """Return the name and version of the library that decodes films, and whether it was built with FFmpeg, which it needs."""
+    return f"OpenCV {cv2.__version__}", cv2.CAP_FFMPEG in cv2.videoio_registry.getStreamBackends()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """One frame of a film."""

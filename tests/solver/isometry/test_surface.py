@@ -135,6 +135,16 @@ def test_the_focal_sweep_starts_where_the_surface_is_not_stretched(monkeypatch: 
     assert shortest / focal_sweep.FOCAL_STEP < min(focals) <= shortest
 
 
+def test_a_given_focal_length_is_kept_where_the_surface_is_stretched(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = 0.8 * DIAGONAL
+    with_inconsistencies(monkeypatch, lambda focal: 0.002 + 0.02 * float(np.log(focal / 400)) ** 2)
+    monkeypatch.setattr(focal_sweep, "_stretched", lambda graph, found: found.inconsistency > 0.01)
+    tried = focal_sweep.sweep(SEARCH, given, DIAGONAL, given=True)
+    assert tried[0].focal == given
+    assert all(each.found.inconsistency <= 0.01 for each in tried[1:])
+    assert all(each.focal != given for each in focal_sweep.sweep(SEARCH, given, DIAGONAL, given=False))
+
+
 @pytest.mark.parametrize("given", [0.1, 0.15, 7.0, 20.0])
 def test_an_improbable_focal_length_is_compared_with_others(monkeypatch: pytest.MonkeyPatch, given: float) -> None:
     with_inconsistencies(monkeypatch, lambda focal: 0.002 + 0.02 * float(np.log(focal / 800)) ** 2)
