@@ -280,8 +280,8 @@ def _stretched(graph: SurfaceGraph, found: Isometry) -> bool:
     ray = graph.rays[frame, first] + graph.rays[frame, second]
     depth = np.square((apart * ray).sum(axis=1)) / np.square(ray).sum(axis=1)
     in_depth, whole = (np.bincount(frame, each) for each in (depth, np.square(apart).sum(axis=1)))
-    deep = (in_depth > MAX_DEPTH_SHARE * whole)[whole > 0]
-    return bool((farthest > MAX_DEPTH_RATIO * nearest).any() or deep.all())
+    flat = (in_depth <= MAX_DEPTH_SHARE * whole)[whole > 0]
+    return bool((farthest > MAX_DEPTH_RATIO * nearest).any() or (len(flat) > 0 and not flat.any()))
 
 
 def _carried(depths: Floats, seen: NDArray[np.bool_], ratio: float) -> Floats:
