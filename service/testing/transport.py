@@ -7,12 +7,15 @@ is. This transport runs the application on its own event loop and returns each p
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 from collections.abc import AsyncIterator, Coroutine, Iterator
 from typing import Any, TypeVar
 
 import httpx
 from fastapi import FastAPI
+
+_log = logging.getLogger("pliant.service")
 
 T = TypeVar("T")
 Message = dict[str, Any]
@@ -113,6 +116,8 @@ class Request:
     async def _run(self) -> None:
         try:
             await self._app(self._scope, self._receive, self._send)
+        except Exception:  # noqa: BLE001 - the client has the answer 500; a server, too, logs what caused it
+            _log.exception("error in %s %s", self._scope["method"], self._scope["path"])
         finally:
             self._messages.put_nowait(None)
 

@@ -18,6 +18,7 @@ from pliant.client._sync.transport import Exchange
 from pliant.client.retry import Attempts, Contact, Retry
 from pliant.schemas.job import Artifact
 from pliant.service.testing import InMemoryService
+from pliant.worker.jobs.service import Jobs
 
 SIZE = 64 * 2**20
 ROOM = 4 * 2**20
@@ -138,3 +139,18 @@ def test_async_downloads_are_streamed(artifact: Artifact, tmp_path: Path) -> Non
             return await async_download(AsyncExchange(http, attempts()), "/file", artifact, tmp_path, on_download=None)
 
     assert asyncio.run(fetch()).stat().st_size == SIZE
+
+
+def test_the_in_memory_service_logs_why_a_request_failed(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    service = InMemoryService()
+
+    def broken(jobs: Jobs, **options: object) -> None:
+        raise RuntimeError("a defect")
+
+    monkeypatch.setattr(Jobs, "page", broken)
+    with httpx.Client(transport=service, base_url="http://pliant") as http:
+        assert http.get("/v1/jobs").status_code == 500
+    causes = [record.exc_info[1] for record in caplog.records if record.exc_info]
+    assert [str(cause) for cause in causes] == ["a defect"]
