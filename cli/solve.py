@@ -36,6 +36,7 @@ from pliant.cli.show import (
 
 if TYPE_CHECKING:
     from pliant.schemas.job import Interpretation
+    from pliant.schemas.options import Options
     from pliant.worker.jobs.finished import Finished
 
 Threads = Annotated[int | None, typer.Option("--threads", help="Threads to use; all cores if not given.", min=1)]
@@ -144,11 +145,13 @@ def inspect(
         refuse_parts_of_tracks(mesh=mesh, ground_truth=ground_truth, rotations=rotations)
         inspect_film(file, region=region, options=options, as_json=as_json)
         return
+    from pliant.client.multipart import checked_options
+
+    checked = checked_options(options)
     if url == "":
-        from pliant.client.multipart import checked_options
         from pliant.worker.formats import read_inputs
 
-        checked, faces = checked_options(options), file_or_word(mesh)
+        faces = file_or_word(mesh)
         interpretation = read_inputs(
             tracks=file, mesh=faces, ground_truth=ground_truth, rotations=rotations, options=checked
         ).interpretation
@@ -161,9 +164,7 @@ def inspect(
     if as_json:
         print_json(dump_interpretation(interpretation))
     else:
-        sizes = {"image_size", "focal"} & options.keys() or interpretation.image_size
-        tested = interpretation.num_points > 0 and sizes and options.get("surface", "auto") == "auto"
-        show_inputs(interpretation, *([("note", SHEET_TEST)] if tested else []))
+        show_inputs(interpretation, *([("note", SHEET_TEST)] if tests_for_sheet(interpretation, checked) else []))
 
 
 def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:
@@ -194,6 +195,17 @@ def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:
 def file_or_word(mesh: str | None) -> Path | str | None:
     """Return the path of a mesh file, or the text unchanged if it is a grid size or `none`."""
     return Path(mesh) if mesh is not None and Path(mesh).is_file() else mesh
+
+
+def tests_for_sheet(interpretation: Interpretation, options: Options) -> bool:
+    """Return whether tracks are tested for a sheet before they are solved as a free surface."""
+    from pliant.solver.reconstruction.surface import tries_isometry
+    from pliant.worker.formats.solver_settings import solver_settings
+    from pliant.worker.formats.tracks.film_tracks import tracks_options
+
+    if interpretation.num_points == 0 or interpretation.has_rotations or options.surface != "auto":
+        return False
+    return tries_isometry(None, solver_settings(tracks_options(options, interpretation)))
 
 
 def show_inputs(interpretation: Interpretation, *further: tuple[str, str]) -> None:

@@ -132,7 +132,7 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
     # A given focal length may be outside the range.
     ends = min(FOCAL_RANGE[0] * diagonal, focal), max(FOCAL_RANGE[1] * diagonal, focal)
     begun = search.begun(focal)
-    first = None if begun is None else _first(begun, focal, focal if given else ends[0])
+    first = None if begun is None else _first(begun, focal, shortest=focal if given else ends[0])
     if begun is None or first is None:
         return []
     search = begun
@@ -145,9 +145,8 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
         tried = _downhill(search, tried, ends)
     if not given and _may_be_accepted(tried, ends):
         tried += _golden(search, least_of(tried))
-        tried += _beside(
-            search, tried, least_of(tried)
-        )  # the new minimum may lack a neighbour at the distance of a step
+        # The new minimum may lack a neighbour at the distance of a step.
+        tried += _beside(search, tried, least_of(tried))
     return tried
 
 

@@ -53,7 +53,7 @@ isometric."""
 
 HOPELESS = 0.025
 """I of the subset `SMALL_PART` at the best of `GLANCES` focal lengths above which `auto` rejects isometry. Measured: paper, a page and
-flags .003 to .018, .022 at half the true focal length; most bodies .021 to .06."""
+flags near the camera .003 to .018, .022 at half the true focal length; most bodies .021 to .06, but shallow faces and arms less."""
 
 SMALL_PART = (30, 12, 10)
 """Numbers of anchors, frames and neighbours in the subset of the first test."""

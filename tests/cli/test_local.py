@@ -408,4 +408,5 @@ def test_inspect_of_tracks_names_the_test_for_a_sheet_where_it_is_possible(tmp_p
     for possible in ("image_size=640x480", "focal=1000"):
         assert SHEET_TEST in words(possible)
         assert SHEET_TEST not in words(possible, "surface=free")
+        assert SHEET_TEST not in words(possible, "camera=orthographic")
     assert SHEET_TEST not in words()

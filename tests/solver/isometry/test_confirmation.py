@@ -157,19 +157,19 @@ def test_surfaces_stretched_along_the_rays_do_not_count(monkeypatch: pytest.Monk
     assert tried_at(search, 1.1 * FOCAL, first) is None
 
 
-@pytest.mark.parametrize(("tilt", "seen_from_edge"), [(0.0, False), (60.0, False), (89.9, False), (0.0, True)])
-def test_no_plane_is_stretched_however_it_is_tilted(tilt: float, seen_from_edge: bool) -> None:
-    """Edges in all directions in a plane that is seen from its edge have half of their squared lengths in depth."""
+@pytest.mark.parametrize(("tilt", "drawn_out"), [(0.0, False), (60.0, False), (89.9, False), (0.0, True)])
+def test_no_plane_is_stretched_however_it_is_tilted(tilt: float, drawn_out: bool) -> None:
+    """Edges in all directions in a plane that is seen from its edge have half of their squared lengths in depth, and more if drawn out."""
     angles = 2 * np.pi * np.arange(12) / 12
     wheel = np.concatenate([np.zeros((1, 2)), np.stack([np.cos(angles), np.sin(angles)], axis=1)])
     turn = np.radians(tilt)
     points = np.stack([wheel[:, 0], np.cos(turn) * wheel[:, 1], 1000 + np.sin(turn) * wheel[:, 1]], axis=1)
-    if seen_from_edge:  # and drawn out by a tenth along the viewing rays
+    if drawn_out:  # by a tenth along the viewing rays
         points = np.stack([wheel[:, 0], 0 * wheel[:, 1], 1000 + 1.1 * wheel[:, 1]], axis=1)
     edges = np.array([(0, rim) for rim in range(1, 13)])
     graph = SurfaceGraph((points / points[:, 2:])[None], np.ones((1, 13)), edges)
     found = Isometry(points[None, :, 2], np.ones(12), 0.0)
-    assert focal_sweep._stretched(graph, found) is seen_from_edge
+    assert focal_sweep._stretched(graph, found) is drawn_out
 
 
 def test_fewer_than_two_frames_per_half_confirm_nothing() -> None:
