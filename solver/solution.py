@@ -94,7 +94,7 @@ class Solution:
     """Wall time per stage."""
 
     shapes_std: Floats | None = None
-    """Standard deviation of every position, shape `(F, P)`, the unit of the shapes; None for priors without a posterior."""
+    """Standard deviation of every position, shape `(F, P)`, the unit of the shapes; None for free surfaces without a posterior."""
 
     trust: Trust | None = None
     """Expected error, and a verdict with reasons."""

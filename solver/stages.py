@@ -57,6 +57,9 @@ SHEET_FRAME_SECONDS, SHEET_FRAMES_UNITS = 0.055, 60
 SHEET_POINT_SECONDS = 4e-6
 """And in all points: seconds per frame and point, measured for 20 and 150 frames of 10,000 points."""
 
+SHEET_ERROR_SECONDS, SHEET_ERROR_UNITS = 1.0, 60
+"""And its standard deviations, in the frames of the search: seconds and units."""
+
 COMPLETION_SECONDS, MOST_COMPLETED, RANK_GROWTH = 8e-7, (60, 600), 2.0
 """Completion of hidden positions: seconds per squared frame count and point; the numbers of frames and of points above which the time no
 longer grows, because the ranks tried end at 40; and the ratio of the times of consecutive ranks."""
@@ -183,10 +186,12 @@ def search_for_sheet(frames: int) -> list[Stage]:
 
 def accepted_sheet(frames: int, points: int) -> list[Stage]:
     """Return the stages that remain once the tracks are found to be those of an isometric surface."""
-    stages = [Stage("sheet", SHEET_SECONDS * min(frames / SURFACE_FRAMES, 1.0), SHEET_UNITS)]
+    searched = min(frames / SURFACE_FRAMES, 1.0)
+    stages = [Stage("sheet", SHEET_SECONDS * searched, SHEET_UNITS)]
     if frames > SURFACE_FRAMES:
         stages.append(Stage("sheet_frames", SHEET_FRAME_SECONDS * frames, SHEET_FRAMES_UNITS))
-    return [*stages, Stage("sheet_points", SHEET_POINT_SECONDS * frames * points, 1)]
+    stages.append(Stage("sheet_points", SHEET_POINT_SECONDS * frames * points, 1))
+    return [*stages, Stage("sheet_error", SHEET_ERROR_SECONDS * searched, SHEET_ERROR_UNITS)]
 
 
 def unseen_frames(visible: Floats) -> float:

@@ -2,8 +2,9 @@
 
 The expected error is the root mean variance of the positions divided by the size of the shapes. The variance is the sum of the posterior
 variance (`shapes.uncertainty`) and that of a jackknife over compact regions (`shapes.jackknife`), because cameras and prior are estimated
-from the same tracks. The verdict adds signs of failure that the variance of a wrong model does not show: tracks that the shapes do not
-explain, a camera that hardly turned around the object, a sheet whose pose signs are ambiguous, and positions that no frame shows.
+from the same tracks; that of isometric surfaces is from a bootstrap (`isometry.deviations`). The verdict adds signs of failure that the
+variance of a wrong model does not show: tracks that the shapes do not explain, a camera that hardly turned around the object, a sheet whose
+pose signs are ambiguous, and positions that no frame shows.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class Trust:
     """Sentences with figures that explain why the verdict is not `good`, the most serious first."""
 
     expected_error: float | None
-    """Expected `e3d_frame`, relative to the object's size; None for priors without a posterior."""
+    """Expected `e3d_frame`, relative to the object's size; None for free surfaces without a posterior."""
 
     interval: tuple[float, float] | None
     """Interval that contains the true error in three of four solves of `benchmarks.trust`.
@@ -177,10 +178,10 @@ def assess(
     given_weights : bool
         Whether the user gave a weight of the priors, which the standard deviations do not count.
     """
-    shapes, rotations, shapes_std = solution.shapes, solution.camera.rotations, solution.shapes_std
+    shapes, rotations = solution.shapes, solution.camera.rotations
     size = size_of(shapes)
     pulse()
-    expected = None if shapes_std is None else float(np.sqrt(np.square(shapes_std).mean())) / size
+    expected = _expected(solution)
     residual, hidden = _fit(solution, visible, size)
     turn = turned(rotations[shown])
     outweighed = given_weights and expected is not None and residual * size > OUTWEIGHED * solution.choices.noise
@@ -206,27 +207,46 @@ def assess(
     if unclear_camera is not None:
         found.append((Verdict.WITH_CARE, unclear_camera))
     verdict, reasons = _most_serious_first(found)
-    interval = (INTERVAL[0] * expected, INTERVAL[1] * expected) if expected is not None and bounded else None
+    interval = _interval(expected) if bounded else None
     return Trust(
         verdict, reasons, expected, interval, turn, residual, hidden, held_out_error, turning, deforming,
     )  # fmt: skip
 
 
-def assess_isometric(solution: Solution, *, ordered: bool) -> Trust:
+def assess_isometric(solution: Solution, *, ordered: bool, doubted: bool) -> Trust:
     """Return the verdict on the solution of an isometric surface, whose weights are those of the observations used.
 
-    Constant edge lengths, not the turn of the camera, determine its depth. There is no expected error, because isometry is not a
-    Gaussian model. Each warning of the solution is a reason for `with_care`.
+    Constant edge lengths, not the turn of the camera, determine its depth. Each warning of the solution is a reason for `with_care`.
+
+    Parameters
+    ----------
+    solution : Solution
+        With standard deviations.
+    ordered : bool
+        Whether the frames are in the order of a film.
+    doubted : bool
+        Whether the evidence for constant lengths or the focal length is weak. Then the expected error is a lower bound.
     """
     shapes, rotations = solution.shapes, solution.camera.rotations
-    residual, hidden = _fit(solution, solution.weights, size_of(shapes))
+    expected, (residual, hidden) = _expected(solution), _fit(solution, solution.weights, size_of(shapes))
     turning, deforming = per_frame(shapes, rotations) if ordered else (None, None)
     warned = [(Verdict.WITH_CARE, warning) for warning in solution.choices.warnings]
-    verdict, reasons = _most_serious_first([*warned, *_observation_signs(residual, hidden)])
+    errors = _error_signs(expected, None, bounded=not doubted)
+    verdict, reasons = _most_serious_first([*warned, *_observation_signs(residual, hidden), *errors])
     return Trust(
-        verdict, reasons, None, None, turned(rotations), residual, hidden,
+        verdict, reasons, expected, None if doubted else _interval(expected), turned(rotations), residual, hidden,
         degrees_per_frame=turning, deformation_per_frame=deforming, depth_from_lengths=True,
     )  # fmt: skip
+
+
+def _expected(solution: Solution) -> float | None:
+    """Return the expected error, relative to the size; None without standard deviations."""
+    std = solution.shapes_std
+    return None if std is None else float(np.sqrt(np.square(std).mean())) / size_of(solution.shapes)
+
+
+def _interval(expected: float | None) -> tuple[float, float] | None:
+    return None if expected is None else (INTERVAL[0] * expected, INTERVAL[1] * expected)
 
 
 def _outweighed(residual: float) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from pliant.solver.isometry.focal_sweep import FocalSearch, Tried
 from pliant.solver.isometry.inextensible import maximum_depth
 from pliant.solver.isometry.restarts import refine_with_restarts
-from pliant.solver.model.so3 import nearest
+from pliant.solver.model.so3 import rotations_of
 from pliant.solver.records import Floats
 
 DISAGREEMENT = 0.02
@@ -24,9 +24,6 @@ DECISIVE = 8.0
 clear by itself. Measured: a T-shirt on a line 500, a hanging leaf 12 and 13, made-up paper 40 to 1,400 where it is recovered well, 1 and 7
 where not; an arm of three boxes 1.5 and 4.4, a sheet that tears, without perspective, 1.6. One that tears near the camera has 41, but is
 recovered alike as a free surface (`reconstruction.surface`)."""
-
-ALIGNMENTS = 10
-"""Alternations between the rigid shape and the rotations of the frames."""
 
 
 def disagreement(search: FocalSearch, chosen: Tried) -> float:
@@ -59,9 +56,5 @@ def unlike(lengths: Floats, others: Floats) -> float:
 def deformation(points: Floats) -> float:
     """Return the RMS distance of shapes `(F, P, 3)` from the best-fitting rigid shape, relative to their RMS size."""
     centred = points - points.mean(axis=1, keepdims=True)
-    mean = centred[0]
-    aligned = centred
-    for _ in range(ALIGNMENTS):
-        aligned = centred @ nearest(centred.transpose(0, 2, 1) @ mean)
-        mean = aligned.mean(axis=0)
-    return float(np.sqrt(np.square(aligned - mean).sum() / np.square(centred).sum()))
+    aligned = centred @ rotations_of(centred)
+    return float(np.sqrt(np.square(aligned - aligned.mean(axis=0)).sum() / np.square(centred).sum()))

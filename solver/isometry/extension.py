@@ -46,6 +46,9 @@ class Extended:
     placed: NDArray[np.bool_]
     """Points with a template position, shape `(P,)`; the others are put in the middle of the surface."""
 
+    places: Floats
+    """Template positions, shape `(P, 2)`; the middle for points without one."""
+
 
 def flatten(edges: Indices, lengths: Floats, count: int) -> Floats | None:
     """Return template positions `(A, 2)` with standard deviation 1; None if the graph is not connected."""
@@ -123,7 +126,8 @@ def extend(
     surface = TemplateMap.of(template, anchors, focal, centre)
     place = places_of(surface, tracks, sure, images, known)
     placed: NDArray[np.bool_] = np.asarray(np.isfinite(place).all(axis=1))
-    space = surface.space(np.where(placed[:, None], place, 0.0))
+    places = np.where(placed[:, None], place, 0.0)
+    space = surface.space(places)
     image = surface.image(space)
     off = sure * np.linalg.norm(image - tracks, axis=2)
     compared = seen & placed
@@ -134,7 +138,7 @@ def extend(
     own = compared & ~outliers
     tracks = image + share_of_track(off[own], confidence, noise_std)[..., None] * (tracks - image)
     rays = np.concatenate([(tracks - centre) / focal, np.ones((*seen.shape, 1))], axis=2)
-    return Extended(np.where(own[..., None], rays * space[..., 2:], space), outliers, placed)
+    return Extended(np.where(own[..., None], rays * space[..., 2:], space), outliers, placed, places)
 
 
 def share_of_track(off: Floats, confidence: Floats, noise_std: float) -> Floats:

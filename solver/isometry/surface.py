@@ -13,9 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.evaluation.trust import size_of
 from pliant.solver.isometry.anchors import choose_anchors, connected, nearest_neighbours, unlike_frames
 from pliant.solver.isometry.arc_lengths import refine_along_surface
 from pliant.solver.isometry.confirmation import DECISIVE, DISAGREEMENT, deformation, disagreement
+from pliant.solver.isometry.deviations import deviations_at, standard_deviations
 from pliant.solver.isometry.extension import MIN_ANCHORS, Extended, complete_anchors, extend, flatten
 from pliant.solver.isometry.focal_sweep import (
     CLEAR,
@@ -115,6 +117,9 @@ class IsometricSurface:
     principal_point: tuple[float, float]
     """Given or assumed principal point, pixels."""
 
+    deviations: Floats
+    """Standard deviations of the points' positions, the same in all frames, shape `(P,)`, the unit of `points`."""
+
     inconsistency: float
     """I of the anchors over all frames."""
 
@@ -129,6 +134,7 @@ def isometric_surface(
     principal_point: tuple[float, float] | None = None,
     image_size: tuple[float, float] | None = None,
     required: bool = False,
+    seed: int = 0,
     should_stop: ShouldStop = never,
 ) -> IsometricVerdict:
     """Decide whether the tracks show an isometric surface, and reconstruct it.
@@ -145,6 +151,8 @@ def isometric_surface(
         Pixels.
     required : bool
         Return the surface, with a warning, even if the evidence is weak. The surface is None only if no surface could be computed.
+    seed : int
+        Of the noise with which the standard deviations are computed.
     should_stop : callable, optional
         Called between units of work. If it returns True during the search, isometry is rejected; later, refinement ends early.
     """
@@ -161,7 +169,7 @@ def isometric_surface(
         return IsometricVerdict("Stopped before the test for isometry had finished.", _trace(tried))
     if not tried:
         return IsometricVerdict("No isometric surface was found: the conic program has no solution.", _trace(tried))
-    return _verdict(search, tracks, tried, focal, required)
+    return _verdict(search, tracks, tried, focal, required, seed)
 
 
 def _search(tracks: Tracks, centre: Floats, focal: float, required: bool, should_stop: ShouldStop) -> FocalSearch | str:
@@ -186,7 +194,7 @@ def _unrecognised_warning() -> str:
 
 
 def _verdict(
-    search: FocalSearch, tracks: Tracks, tried: list[Tried], focal: float | None, required: bool
+    search: FocalSearch, tracks: Tracks, tried: list[Tried], focal: float | None, required: bool, seed: int
 ) -> IsometricVerdict:
     """Return the verdict on the surface at the given focal length, or at the best of those tried."""
     least = least_of(tried)
@@ -201,7 +209,7 @@ def _verdict(
         why = f"Solved as an isometric sheet, as set, although {why}."
     if judgement.clear or required:
         expect_only(search.should_stop, accepted_sheet(tracks.num_frames, tracks.num_points))
-    surface = _everywhere(search, tracks, chosen)
+    surface = _everywhere(search, tracks, chosen, seed)
     if surface is None:
         return IsometricVerdict("No isometric surface was found: its points are not connected.", _trace(tried))
     if not required and (rigid := _rigid(search, surface)) is not None:
@@ -312,7 +320,7 @@ def _glance(search: FocalSearch, focal: float) -> float:
     return min(refine(graph, depths, iterations=10).inconsistency for graph, depths in tried if depths is not None)
 
 
-def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried) -> IsometricSurface | None:
+def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried, seed: int) -> IsometricSurface | None:
     """Return the surface in all frames and points at the chosen focal length, or None if the anchors are not connected."""
     enter(search.should_stop, "sheet")
     part = chosen.graph
@@ -338,9 +346,14 @@ def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried) -> Isometric
     )  # fmt: skip
     if not np.isfinite(all_of_it.points).all():
         return None
+    enter(search.should_stop, "sheet_error")
+    shown = search.frames[enough[search.frames]]
+    deviations = standard_deviations(whole, found, points, shown, seed=seed, should_stop=search.should_stop)
     return IsometricSurface(
         all_of_it.points, all_of_it.outliers, all_of_it.placed, enough, chosen.focal,
-        (float(search.centre[0]), float(search.centre[1])), found.inconsistency, search.anchors.noise_std,
+        (float(search.centre[0]), float(search.centre[1])),
+        deviations_at(all_of_it.places, all_of_it.placed, deviations, template=template, size=size_of(points)),
+        found.inconsistency, search.anchors.noise_std,
     )  # fmt: skip
 
 

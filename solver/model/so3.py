@@ -1,4 +1,4 @@
-"""Mathematics of SO(3), for stacks of rotations: exponential map, its Jacobian, logarithm, nearest rotation."""
+"""Mathematics of SO(3), for stacks of rotations: exponential map, its Jacobian, logarithm, nearest rotation, rotations of shapes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ HAT = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, 
 
 IDENTITY = np.eye(3)
 TINY = float(np.finfo(np.float64).tiny)
+
+ALTERNATIONS = 5
+"""Alternations between mean shape and rotations, each starting from the last; the third already changes angles by less than 1e-3."""
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
 """The depth mirror D: (S, R) and (S·D, D·R·D) have the same orthographic image."""
@@ -91,4 +94,26 @@ def angles_between(first: Floats, second: Floats) -> Floats:
 
 def start_at_identity(rotations: Floats) -> Floats:
     """Return the rotations in the world of the first frame's camera: R_f R_0ᵀ."""
+    return np.asarray(rotations @ rotations[0].T)
+
+
+def rotations_of(centred: Floats) -> Floats:
+    """Return rotations R_f, camera from world, that align each S_f R_f with the mean shape; the first is the identity.
+
+    Generalised Procrustes analysis (Gower 1975), from the shape nearest to the mean.
+
+    Parameters
+    ----------
+    centred : shape (F, P, 3)
+        Shapes S_f in camera axes, centred on the origin.
+
+    Returns
+    -------
+    shape (F, 3, 3)
+    """
+    mean = centred[int(np.square(centred - centred.mean(axis=0)).sum(axis=(1, 2)).argmin())]
+    rotations = np.tile(np.eye(3), (len(centred), 1, 1))
+    for _ in range(ALTERNATIONS):
+        rotations = nearest(centred.transpose(0, 2, 1) @ mean)
+        mean = (centred @ rotations).mean(axis=0)
     return np.asarray(rotations @ rotations[0].T)

@@ -50,7 +50,7 @@ def isometric_verdict(
         return _untested(tracks) if settings.surface == "auto" and _may_be_isometric(cameras, settings) else None
     return isometric_surface(
         downwards(tracks) if settings.y_up else tracks, focal=settings.focal_length, principal_point=centre_downwards(settings),
-        image_size=settings.image_size, required=settings.surface == "isometric", should_stop=monitor,
+        image_size=settings.image_size, required=settings.surface == "isometric", seed=settings.seed, should_stop=monitor,
     )  # fmt: skip
 
 

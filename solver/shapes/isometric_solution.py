@@ -12,13 +12,10 @@ from dataclasses import replace
 import numpy as np
 from pliant.solver.evaluation.trust import assess_isometric
 from pliant.solver.isometry.surface import IsometricSurface, IsometricVerdict
-from pliant.solver.model.so3 import nearest
+from pliant.solver.model.so3 import rotations_of
 from pliant.solver.records import Camera, Choices, Floats, Tracks, mean_scale
 from pliant.solver.settings import Settings
 from pliant.solver.solution import Outcome, Solution, Trace
-
-ALTERNATIONS = 5
-"""Alternations between mean shape and rotations, each starting from the last; the third already changes angles by less than 1e-3."""
 
 
 def isometric_solution(
@@ -49,7 +46,7 @@ def isometric_solution(
     """
     surface = verdict.surface
     assert surface is not None
-    shapes, camera = in_world_axes(surface)
+    shapes, camera, shapes_std = in_world_axes(surface)
     camera = replace(camera, focal_std=0.0 if settings.focal_length is not None else None)
     if settings.y_up:
         camera = upwards(camera)
@@ -60,21 +57,28 @@ def isometric_solution(
     trace = Trace(np.array([surface.inconsistency]), np.array([median]), np.zeros(1, dtype=np.int32))
     choices = _choices(verdict, surface, unit, float(surface.outliers.sum() / seen.sum()))
     outcome = Outcome.STOPPED if stopped else Outcome.CONVERGED
-    solution = Solution(shapes, camera, residual, weights, trace, outcome, choices, seconds)
-    return replace(solution, trust=assess_isometric(solution, ordered=settings.order == "film"))
+    solution = Solution(shapes, camera, residual, weights, trace, outcome, choices, seconds, shapes_std)
+    trust = assess_isometric(solution, ordered=settings.order == "film", doubted=bool(verdict.warnings))
+    return replace(solution, trust=trust)
 
 
-def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera]:
-    """Return centred shapes `(F, P, 3)` in world axes, and cameras that reproduce the images of the surface."""
+def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera, Floats]:
+    """Return centred shapes `(F, P, 3)` in world axes, cameras that reproduce the images of the surface, and standard deviations `(F, P)`.
+
+    A frame that copies the shape of another one may differ from it by the deformation of the surface, which is added to its variance.
+    """
     origin = surface.points.mean(axis=1)
     centred = surface.points - origin[:, None]
-    rotations = _rotations(centred[:, surface.placed])
+    rotations = rotations_of(centred[:, surface.placed])
     scales = surface.focal / origin[:, 2]
     unit = mean_scale(scales)
     shapes = unit * (centred @ rotations)
     point = np.array(surface.principal_point)
     translations = point + scales[:, None] * origin[:, :2]
-    return shapes, Camera(rotations, scales / unit, translations, surface.focal, principal_point=point)
+    deformation = np.square(shapes - shapes.mean(axis=0)).sum(axis=2).mean(axis=0)
+    variance = np.square(unit * surface.deviations) + np.where(surface.shown[:, None], 0.0, deformation)
+    camera = Camera(rotations, scales / unit, translations, surface.focal, principal_point=point)
+    return shapes, camera, np.sqrt(variance)
 
 
 def downwards(tracks: Tracks) -> Tracks:
@@ -99,16 +103,6 @@ def upwards(camera: Camera) -> Camera:
         principal_point=camera.principal_point * (1.0, -1.0),
         y_up=True,
     )
-
-
-def _rotations(centred: Floats) -> Floats:
-    """Return rotations R_f, camera from world, `(F, 3, 3)`, that align each S_f R_f with the mean shape; the first is the identity."""
-    mean = centred[int(np.square(centred - centred.mean(axis=0)).sum(axis=(1, 2)).argmin())]
-    rotations = np.tile(np.eye(3), (len(centred), 1, 1))
-    for _ in range(ALTERNATIONS):
-        rotations = nearest(centred.transpose(0, 2, 1) @ mean)
-        mean = (centred @ rotations).mean(axis=0)
-    return np.asarray(rotations @ rotations[0].T)
 
 
 def _choices(verdict: IsometricVerdict, surface: IsometricSurface, unit: float, outliers: float) -> Choices:

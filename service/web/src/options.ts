@@ -89,7 +89,7 @@ const HELP: Record<string, string> = {
     "none: viewers compute their own.",
   colours:
     "none: no colours. error: by the distance from the ground truth, or by the reprojection residual where there is none. " +
-    "expected_error: by the error that the solver expects, in percent of the object's size; only the Gaussian prior estimates it.",
+    "expected_error: by the error that the solver expects, in percent of the object's size, with the Gaussian prior and for isometric surfaces.",
   axes: "viewer: y up, as in glTF. tracks: those of the tracks, as in the NPZ file.",
   glb_quantized: "Positions of 16 bits and normals of 8 bits: about half the size, rounded to a 65,000th of the largest extent and half a degree.",
   glb_motion:

@@ -733,7 +733,7 @@ export interface components {
             normals: "static" | "animated" | "none";
             /**
              * Colours
-             * @description none: no colours. error: points are coloured by their distance from the ground truth, or by their reprojection residual where there is none. expected_error: by the error that the solver expects, in percent of the object's size; only prior gaussian estimates it. PLY, OBJ and USD are coloured in every frame, shapes.glb by the mean over frames.
+             * @description none: no colours. error: points are coloured by their distance from the ground truth, or by their reprojection residual where there is none. expected_error: by the error that the solver expects, in percent of the object's size, with prior gaussian and for isometric surfaces. PLY, OBJ and USD are coloured in every frame, shapes.glb by the mean over frames.
              * @default none
              * @enum {string}
              */

@@ -21,6 +21,7 @@ from pliant.solver import (
 )
 from pliant.solver.evaluation.metrics import e3d_frame
 from pliant.solver.evaluation.trust import (
+    INTERVAL,
     NO_POSTERIOR,
     Trust,
     Verdict,
@@ -80,13 +81,29 @@ def test_an_isometric_surface_needs_no_turn_but_must_be_seen_and_explain_the_tra
     shapes = np.random.default_rng(0).normal(size=(FRAMES, POINTS, 3))
     still, near, seen = np.tile(np.eye(3), (FRAMES, 1, 1)), np.full((FRAMES, POINTS), 0.001), np.ones((FRAMES, POINTS))
 
-    def isometric(residuals: Any = near, visible: Any = seen, warnings: tuple[str, ...] = ()) -> Trust:
-        choices = replace(CHOICES, warnings=warnings)
-        return assess_isometric(solution_of(shapes, still, residuals, weights=visible, choices=choices), ordered=False)
+    def isometric(
+        residuals: Any = near,
+        visible: Any = seen,
+        warnings: tuple[str, ...] = (),
+        *,
+        std: float = 0.02,
+        doubted: bool = False,
+    ) -> Trust:
+        choices, deviations = replace(CHOICES, warnings=warnings), np.full((FRAMES, POINTS), std * size_of(shapes))
+        solution = solution_of(shapes, still, residuals, weights=visible, choices=choices, shapes_std=deviations)
+        return assess_isometric(solution, ordered=False, doubted=doubted)
 
     good = isometric()
     assert (good.verdict, good.reasons) == (Verdict.GOOD, ())
-    assert good.sentence == "The error is not estimated; depth rests on constant lengths."
+    assert good.sentence == "Expected error about 2 % of the object's size; depth rests on constant lengths."
+    assert good.interval == pytest.approx((0.02 * INTERVAL[0], 0.02 * INTERVAL[1]))
+    doubtful = isometric(doubted=True)
+    assert (doubtful.expected_error, doubtful.interval) == (good.expected_error, None)
+    assert doubtful.sentence == "Expected error at least 2 % of the object's size; depth rests on constant lengths."
+    assert isometric(std=0.1).reasons == ("The error may be as large as 36 % of the object's size.",)
+    assert isometric(std=0.1, doubted=True).reasons == (
+        "The error is expected to be at least 10 % of the object's size.",
+    )
     little = isometric(visible=seen * (np.arange(POINTS) < 9))
     assert (little.verdict, little.reasons[0][:4]) == (Verdict.WITH_CARE, "70% ")
     assert isometric(np.full((FRAMES, POINTS), 0.9)).verdict is Verdict.DO_NOT_USE
