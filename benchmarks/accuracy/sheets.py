@@ -91,6 +91,8 @@ def solved(sheet: Sheet, *, given: bool = False, surface: str = "auto") -> dict[
     focal = solution.camera.focal
     return {
         "error": error(solution.shapes, sheet.case.shapes), "focal_error": None if focal is None else abs(focal / sheet.focal - 1),
+        "expected_error": None if solution.trust is None else solution.trust.expected_error,
+        "interval": None if solution.trust is None else solution.trust.interval,
         "surface": solution.choices.reasons.get("surface", ""), "verdict": None if solution.trust is None else solution.trust.verdict.value,
     }  # fmt: skip
 
@@ -141,13 +143,15 @@ def table(path: Path) -> str:
     """Return a Markdown table of the errors."""
     found = {(row["sequence"], row["kind"], row["method"]): row for row in rows(path)}
     lines = [
-        "| sequence | tracks | " + " | ".join(METHODS) + " | seconds of CPU, auto |",
-        "|---" * (len(METHODS) + 3) + "|",
+        "| sequence | tracks | " + " | ".join(METHODS) + " | expected, auto | seconds of CPU, auto |",
+        "|---" * (len(METHODS) + 4) + "|",
     ]
     for name, kind in dict.fromkeys((name, kind) for name, kind, _ in found):
+        default = found.get((name, kind, "auto"), {})
         cells = [found.get((name, kind, method), {}).get("error") for method in METHODS]
+        cells.append(default.get("expected_error"))
         shown = ["–" if each is None else f"{each:.4f}".lstrip("0") for each in cells]
-        seconds = found.get((name, kind, "auto"), {}).get("cpu_seconds")
+        seconds = default.get("cpu_seconds")
         lines.append(
             f"| {name} | {kind} | " + " | ".join(shown) + f" | {'–' if seconds is None else f'{seconds:.0f}'} |"
         )
