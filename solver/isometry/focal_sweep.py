@@ -94,7 +94,7 @@ class FocalSearch:
         if self.deepest is None:
             return None
         origin, depths = self.deepest
-        return _carried(depths, self.solved(focal).seen, focal / origin)
+        return refocused(depths, self.solved(focal).seen, focal / origin)
 
     def solved(self, focal: float) -> SurfaceGraph:
         """Return the rays and edges of `frames` at a focal length."""
@@ -246,11 +246,16 @@ def _golden(search: FocalSearch, middle: Tried) -> list[Tried]:
     best = min(range(len(around)), key=lambda index: around[index].found.inconsistency)
     if 0 < best < len(around) - 1:
         three = around[best - 1 : best + 2]
-        x, y = np.log([t.focal for t in three]), np.square([t.found.inconsistency for t in three])
-        bend, slope, _ = np.polyfit(x - x[1], y, 2)
-        if bend > 0:
-            at(float(np.clip(x[1] - slope / (2 * bend), x[0], x[2])))
+        place = least_between(np.log([t.focal for t in three]), np.array([t.found.inconsistency for t in three]))
+        if place is not None:
+            at(place)
     return made
+
+
+def least_between(places: Floats, inconsistencies: Floats) -> float | None:
+    """Return the minimum of the parabola through I² at three logarithms of focal lengths, at most at their ends; None if it has none."""
+    bend, slope, _ = np.polyfit(places - places[1], np.square(inconsistencies), 2)
+    return float(np.clip(places[1] - slope / (2 * bend), places[0], places[2])) if bend > 0 else None
 
 
 def tried_at(search: FocalSearch, focal: float, near: Tried | None) -> Tried | None:
@@ -260,7 +265,7 @@ def tried_at(search: FocalSearch, focal: float, near: Tried | None) -> Tried | N
     stretched, too. Without `near`, the search starts here, and a stretched surface is returned.
     """
     graph = search.solved(focal)
-    beside = None if near is None else _carried(near.found.depths, graph.seen, focal / near.focal)
+    beside = None if near is None else refocused(near.found.depths, graph.seen, focal / near.focal)
     for depths in (beside, search.start(focal)):
         if depths is not None:
             found = refine_with_restarts(graph, depths, should_stop=search.should_stop)
@@ -283,7 +288,7 @@ def _stretched(graph: SurfaceGraph, found: Isometry) -> bool:
     return bool((farthest > MAX_DEPTH_RATIO * nearest).any() or (len(flat) > 0 and not flat.any()))
 
 
-def _carried(depths: Floats, seen: NDArray[np.bool_], ratio: float) -> Floats:
+def refocused(depths: Floats, seen: NDArray[np.bool_], ratio: float) -> Floats:
     """Return depths for a focal length `ratio` times as long: the same relief at `ratio` times the distance."""
     mean = depths.sum(axis=1, keepdims=True) / np.maximum(seen.sum(axis=1, keepdims=True), 1)
     return np.where(seen, np.maximum(ratio * mean + (depths - mean), 0.05 * ratio * mean), 0.0)

@@ -117,6 +117,9 @@ class IsometricSurface:
     principal_point: tuple[float, float]
     """Given or assumed principal point, pixels."""
 
+    focal_std: float
+    """Standard deviation of an estimated focal length, pixels."""
+
     deviations: Floats
     """Standard deviations of the points' positions, the same in all frames, shape `(P,)`, the unit of `points`."""
 
@@ -352,7 +355,8 @@ def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried, seed: int) -
     return IsometricSurface(
         all_of_it.points, all_of_it.outliers, all_of_it.placed, enough, chosen.focal,
         (float(search.centre[0]), float(search.centre[1])),
-        deviations_at(all_of_it.places, all_of_it.placed, deviations, template=template, size=size_of(points)),
+        chosen.focal * deviations.focal,
+        deviations_at(all_of_it.places, all_of_it.placed, deviations.points, template=template, size=size_of(points)),
         found.inconsistency, search.anchors.noise_std,
     )  # fmt: skip
 

@@ -47,7 +47,8 @@ def isometric_solution(
     surface = verdict.surface
     assert surface is not None
     shapes, camera, shapes_std = in_world_axes(surface)
-    camera = replace(camera, focal_std=0.0 if settings.focal_length is not None else None)
+    estimated = None if verdict.warnings else surface.focal_std
+    camera = replace(camera, focal_std=0.0 if settings.focal_length is not None else estimated)
     if settings.y_up:
         camera = upwards(camera)
     seen = tracks.visible > 0

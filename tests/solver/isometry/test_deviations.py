@@ -12,13 +12,16 @@ from pliant.solver.evaluation.metrics import e3d_frame_scaled
 from pliant.solver.evaluation.trust import size_of
 from pliant.solver.isometry.anchors import nearest_neighbours
 from pliant.solver.isometry.deviations import (
+    FOCAL_MODEL_STD,
     MODEL_STD,
     deviations_at,
     exchanged,
+    focal_offset,
     noise_of,
     noisy_rays,
     standard_deviations,
 )  # fmt: skip
+from pliant.solver.isometry.focal_sweep import least_between, refocused
 from pliant.solver.isometry.inextensible import SurfaceGraph
 from pliant.solver.isometry.refinement import Isometry, edge_lengths, inconsistency, refine, typical
 from pliant.solver.model.so3 import exponential, rotations_of
@@ -44,7 +47,7 @@ def deviations(noise: float, *, seed: int = 0) -> Floats:
     sheet = rolled(frames=10)
     graph = noisy(sheet, noise)
     found, points = refined(graph, sheet)
-    return standard_deviations(graph, found, points, np.arange(10), seed=seed) / size_of(sheet.points)
+    return standard_deviations(graph, found, points, np.arange(10), seed=seed).points / size_of(sheet.points)
 
 
 def test_noise_is_that_of_edges_parallel_to_the_picture() -> None:
@@ -116,7 +119,8 @@ def test_deviations_are_about_the_errors(noise: float) -> None:
     sheet = rolled(frames=10)
     graph = noisy(sheet, noise)
     found, points = refined(graph, sheet)
-    expected = np.sqrt(np.square(standard_deviations(graph, found, points, np.arange(10), seed=0)).mean())
+    std = standard_deviations(graph, found, points, np.arange(10), seed=0).points
+    expected = np.sqrt(np.square(std).mean())
     error = e3d_frame_scaled(points, sheet.points)
     assert 0.5 < error / (expected / size_of(sheet.points)) < 2
 
@@ -136,7 +140,7 @@ def test_hidden_anchors_do_not_count() -> None:
     graph = replace(graph, confidence=shown)
     found = refine(graph, np.where(shown > 0, sheet.points[..., 2], 0.0))
     points = np.where(shown[..., None] > 0, found.depths[..., None] * graph.rays, sheet.points)
-    std = standard_deviations(graph, found, points, np.arange(10), seed=0)
+    std = standard_deviations(graph, found, points, np.arange(10), seed=0).points
     assert std[5] == pytest.approx(np.sqrt(np.square(np.delete(std, 5)).mean()), rel=0.05)
     assert std.max() < 5 * np.median(std)
 
@@ -145,9 +149,37 @@ def test_a_stop_leaves_finite_deviations() -> None:
     sheet = rolled(frames=10)
     graph = noisy(sheet, 1.0)
     found, points = refined(graph, sheet)
-    std = standard_deviations(graph, found, points, np.arange(10), seed=0, should_stop=lambda: True)
-    assert (std > 0).all()
-    assert np.isfinite(std).all()
+    stopped = standard_deviations(graph, found, points, np.arange(10), seed=0, should_stop=lambda: True)
+    assert (stopped.points > 0).all()
+    assert np.isfinite(stopped.points).all()
+    assert np.isfinite(stopped.focal)
+
+
+@pytest.mark.parametrize("ratio", [0.96, 1.0, 1.05])
+def test_the_focal_length_of_the_least_inconsistency_is_found_beside_that_of_the_rays(ratio: float) -> None:
+    sheet = rolled(frames=10)
+    graph = noisy(sheet, 0.0)
+    graph = replace(graph, rays=graph.rays / [ratio, ratio, 1.0])
+    found = refine(graph, refocused(sheet.points[..., 2], graph.seen, ratio))
+    assert focal_offset(graph, found) == pytest.approx(-np.log(ratio), abs=0.01)
+
+
+def test_the_focal_length_is_less_certain_with_noise() -> None:
+    sheet = rolled(frames=10)
+
+    def focal(noise: float) -> float:
+        graph = noisy(sheet, noise)
+        return standard_deviations(graph, *refined(graph, sheet), np.arange(10), seed=0).focal
+
+    assert FOCAL_MODEL_STD <= focal(0.0) < 1.2 * FOCAL_MODEL_STD
+    assert focal(0.0) < focal(1.0) < 0.1
+
+
+def test_a_parabola_gives_the_focal_length_between_others() -> None:
+    places = np.array([0.1, 0.3, 0.4])
+    assert least_between(places, np.sqrt(2 + 3 * np.square(places - 0.27))) == pytest.approx(0.27)
+    assert least_between(places, np.sqrt(2 + 3 * np.square(places - 0.9))) == pytest.approx(0.4)
+    assert least_between(places, np.sqrt(5 - 3 * np.square(places - 0.27))) is None
 
 
 def test_points_have_the_deviations_of_the_anchors_around_them() -> None:
@@ -164,7 +196,7 @@ def test_points_have_the_deviations_of_the_anchors_around_them() -> None:
 def test_a_sheet_has_an_expected_error() -> None:
     sheet = rolled(frames=12)
     images = sheet.tracks.points + np.random.default_rng(0).normal(size=sheet.tracks.points.shape)
-    solution = solve(Tracks.from_arrays(images), settings=Settings(image_size=SIZE, focal=FOCAL, surface="isometric"))
+    solution = solve(Tracks.from_arrays(images), settings=Settings(image_size=SIZE, surface="isometric"))
     assert solution.trust is not None
     assert solution.trust.depth_from_lengths
     assert solution.shapes_std is not None
@@ -174,3 +206,19 @@ def test_a_sheet_has_an_expected_error() -> None:
     assert interval is not None
     assert interval[0] < e3d_frame_scaled(solution.shapes, sheet.points) < interval[1]
     assert solution.trust.sentence.startswith("Expected error about")
+    assert solution.camera.focal is not None
+    assert solution.camera.focal_std is not None
+    assert abs(solution.camera.focal - FOCAL) < 3 * solution.camera.focal_std < 0.3 * FOCAL
+
+
+def test_a_given_focal_length_is_exact_and_a_doubtful_one_has_no_deviation() -> None:
+    sheet = rolled("cone", frames=12, stretch=0.2, side=6)
+    given, free = (
+        solve(sheet.tracks, settings=Settings(image_size=SIZE, focal=focal, surface="isometric"))
+        for focal in (FOCAL, None)
+    )
+    assert given.camera.focal_std == 0
+    assert free.camera.focal is not None
+    assert free.camera.focal_std is None
+    assert free.trust is not None
+    assert free.trust.interval is None
