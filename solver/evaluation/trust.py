@@ -21,7 +21,7 @@ from pliant.solver.solution import Solution
 
 INTERVAL = (0.35, 3.6)
 """Ends of the interval for the error, relative to the expected error: about the 10 and 90 % quantiles of true over expected error on the
-calibration sequences of `benchmarks.trust` when they were chosen. Now they contain 46 of 54, and 51 of 71 of the other sequences; in 20 of
+calibration sequences of `benchmarks.trust` when they were chosen. Now they contain 50 of 58, and 54 of 74 of the other sequences; in 20 of
 the other 28 solves the error is smaller. In `benchmarks.accuracy.kinds` the intervals contain 30 of 58; 27 errors are larger."""
 
 POOR, BAD = 0.2, 1.8
