@@ -57,8 +57,8 @@ SHEET_FRAME_SECONDS, SHEET_FRAMES_UNITS = 0.055, 60
 SHEET_POINT_SECONDS = 4e-6
 """And in all points: seconds per frame and point, measured for 20 and 150 frames of 10,000 points."""
 
-SHEET_ERROR_SECONDS, SHEET_ERROR_UNITS = 1.0, 60
-"""And its standard deviations, in the frames of the search: seconds and units."""
+SHEET_ERROR_SECONDS, SHEET_ERROR_UNITS = 2.0, 130
+"""And its standard deviations, in the frames of the search: seconds and units. Measured for paper and a comic page."""
 
 COMPLETION_SECONDS, MOST_COMPLETED, RANK_GROWTH = 8e-7, (60, 600), 2.0
 """Completion of hidden positions: seconds per squared frame count and point; the numbers of frames and of points above which the time no

@@ -47,15 +47,15 @@ and with `auto` (estimate), of films of faces as tracked:
     30 × 2,307        11.3   40.9       13.6
 
 Tracks of a sheet take the times below instead, which only the test can tell unless `surface=isometric` is set: the solver alone,
-processor s, made-up paper. Without the option, the estimates of the last three are 49.5, 48.2 and 57.2 s.
+processor s, made-up paper that the camera goes half round. Without the option, the estimates of the last three are 49.5, 48.2 and 57.2 s.
 
     frames × points   processor, s   estimate
-    20 × 144                   7.9        11.2
-    60 × 144                  13.9        17.2
-    150 × 144                 18.9        23.1
-    150 × 10,000              23.8        29.1
-    600 × 144                 46.2        52.6
-    3,000 × 144              221.3       210.0
+    20 × 144                  10.5        12.8
+    60 × 144                  14.9        19.2
+    150 × 144                 16.2        25.1
+    150 × 10,000              25.6        31.1
+    600 × 144                 27.1        54.6
+    3,000 × 144              132.7       212.0
 
 With blocks of larger overlap, the solver alone took 11.6 GB and 520 processor seconds for 100 × 1,000,000, estimated at 17 GB and 821 s.
 Not covered: sparsely observed points, which take 80 bytes times the square of their number; and time with other options.
