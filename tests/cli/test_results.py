@@ -19,7 +19,7 @@ from fastapi.testclient import TestClient
 from pliant.cli import app
 from pliant.cli.exits import Exit
 from pliant.cli.session import Session
-from pliant.service.routes.local_result import create_viewer, read_result
+from pliant.service.local_result import create_viewer, read_result
 from pliant.service.testing import InMemoryService
 from pliant.worker.artifacts import build_report, write_artifacts
 from pliant.worker.errors import InvalidRequest

@@ -25,7 +25,7 @@ from PIL import Image
 from pliant.schemas.film_limits import FilmLimits
 from pliant.schemas.job import Progress
 from pliant.schemas.options import Options
-from pliant.service.routes.local_result import read_result
+from pliant.service.local_result import read_result
 from pliant.solver.errors import InvalidInput
 from pliant.tracking import FilmError, open_film
 from pliant.tracking import track_film as follow
