@@ -23,9 +23,8 @@ from PIL import Image
 from playwright.sync_api import Browser, Locator, Page, expect
 from pliant.tracking.contact_sheet import small_jpeg
 from pliant.worker.artifacts import build_report, write_artifacts
-from pliant.worker.artifacts.preview import write_preview
 from pliant.worker.films.frame_strip import packed
-from results import make_result
+from results import make_result, preview_of
 from scipy.spatial.transform import Rotation
 
 pytestmark = [
@@ -158,11 +157,9 @@ def off_centre_close_up() -> bytes:
         solution.camera, rotations=turned, scales=np.full(len(GREYS), 0.4), translations=np.full((len(GREYS), 2), (110.0, 100.0)),
         focal=150.0, principal_point=np.array([159.5, 89.5]),
     )  # fmt: skip
-    into = io.BytesIO()
     solution = replace(solution, camera=camera)
     tracks = replace(inputs.tracks, points=camera.project(solution.shapes))
-    write_preview(into, tracks=tracks, mesh=inputs.mesh, solution=solution, texture=inputs.texture)
-    return into.getvalue()
+    return preview_of(tracks, solution, mesh=inputs.mesh, texture=inputs.texture)
 
 
 def drawn_part(pane: Locator, *backgrounds: tuple[int, int, int]) -> np.ndarray:
