@@ -110,7 +110,7 @@ def made(door: Jobs, inputs_file: Path, interpretation: Interpretation) -> Made:
 
     def call(url: str, *, end: bool = True, owner: str | None = None) -> Job:
         hook = Webhook(url=url, secret=SECRET)
-        job = (door if owner is None else door.of(owner)).submit(
+        job, _ = (door if owner is None else door.of(owner)).submit(
             inputs_file, Submission(options=Options(), name="hooked", webhook=hook), interpretation=interpretation
         )
         return door.cancel(job.id) if end else job
@@ -455,7 +455,7 @@ def test_a_retried_job_sends_its_webhook_and_a_job_without_one_does_not(
 ) -> None:
     again = retry(door, made(receiver.url).id)
     door.cancel(again.id)
-    plain = door.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)
+    plain = door.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)[0]
     assert door.cancel(plain.id).status is Status.CANCELLED
     assert pending(webhook_sender.outbox) == 2
     webhook_sender.start()
