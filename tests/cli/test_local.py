@@ -205,6 +205,8 @@ def test_doctor_reports_missing_packages(monkeypatch: pytest.MonkeyPatch) -> Non
     broken = list(doctor.check_packages(without("scipy", "clarabel", "matplotlib")))
     assert verdicts(broken) == {"packages": "bad", "server": "good", "matplotlib": "note"}
     assert broken[0].found == "missing: clarabel, scipy"
+    server = next(each for each in doctor.check_packages(without("uvloop")) if each.what == "server")
+    assert f"rq {version('rq')}, uvicorn {version('uvicorn')}" in server.found, "without uvloop, which Windows lacks"
     monkeypatch.setattr(doctor, "OLDEST_PYTHON", (4, 0))
     assert verdicts(doctor.check_python()) == {"Python": "bad"}
 
