@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import httpx
 import numpy as np
 import pytest
 import trimesh
+from commands import Run
 from fastapi.testclient import TestClient
 from pliant.cli import app
 from pliant.cli.exits import Exit
@@ -24,9 +24,7 @@ from pliant.service.testing import InMemoryService
 from pliant.worker.artifacts import build_report, write_artifacts
 from pliant.worker.errors import InvalidRequest
 from results import make_result
-from typer.testing import CliRunner, Result
-
-Run = Callable[..., Result]
+from typer.testing import CliRunner
 
 
 @pytest.fixture

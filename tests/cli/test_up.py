@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from commands import Run
 from pliant.cli import app
 from pliant.cli.doctor import check_memory, check_variables
 from pliant.cli.exits import Exit
@@ -15,8 +15,6 @@ from pliant.worker.processes import memory
 from pliant.worker.processes.supervisor import Supervisor
 from pliant.worker.settings import Settings
 from typer.testing import CliRunner, Result
-
-Run = Callable[..., Result]
 
 
 @pytest.fixture

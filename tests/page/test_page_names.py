@@ -17,7 +17,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from browsing import why_not
+from browsing import AXE, NEEDS_CHROMIUM
 from paging import DONE, seek, until
 from PIL import Image
 from playwright.sync_api import Browser, Locator, Page, expect
@@ -27,10 +27,7 @@ from pliant.worker.films.frame_strip import packed
 from results import make_result, preview_of
 from scipy.spatial.transform import Rotation
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
+pytestmark = NEEDS_CHROMIUM
 
 POINT_NAMES = tuple(f"Lid {number} ü" for number in range(21 * 31))
 GREYS = (20, 50, 80, 110, 140, 170, 200)
@@ -38,7 +35,6 @@ GREYS = (20, 50, 80, 110, 140, 170, 200)
 GREEN = (0, 255, 0)
 EDGE = 6
 """Pixels at the edge of a pane that may show what is around it, or the outline of the focus."""
-AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 QUICK_LOOK = """const supports = DOMTokenList.prototype.supports;
 DOMTokenList.prototype.supports = function (word) { return word === "ar" || supports.call(this, word); };"""
 

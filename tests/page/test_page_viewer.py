@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 import pytest
 import results
-from browsing import differing_pixels, why_not
+from browsing import AXE, NEEDS_CHROMIUM, differing_pixels
 from paging import DONE, QUICK, TRACKS, packed, seek, until
 from PIL import Image
 from playwright.sync_api import Browser, Locator, Page, expect
@@ -22,12 +22,8 @@ from pliant.solver.gallery import Sequence, corrupt, flag
 from pliant.worker.formats.texture import Texture
 from pliant.worker.formats.tracks.frame_times import mean_rate
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
+pytestmark = NEEDS_CHROMIUM
 
-AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 FRAMES, POINTS = 10, 300
 HALF_TURN = 24
 """Presses of an arrow key that turn the view by 180°."""

@@ -42,6 +42,7 @@ from pliant.worker.webhooks.sender import (
     resolve,
     trusted_by_default,
 )
+from serving import until
 
 SECRET = "whsec_" + base64.b64encode(b"k" * 32).decode()
 LOOPBACK = "127.0.0.0/8"
@@ -136,13 +137,6 @@ def webhook_sender(door: Jobs, soon: None) -> Iterator[WebhookSender]:
 def pending(outbox: Outbox) -> int:
     """The number of messages that are not sent yet."""
     return int(outbox._take.registered_client.zcard(f"{outbox._at}outbox"))
-
-
-def until(holds: Callable[[], object], *, seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < deadline, "it did not come to hold in time"
-        time.sleep(0.02)
 
 
 def test_the_end_of_a_job_is_sent_once_with_signature_and_body(
