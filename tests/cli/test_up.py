@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
@@ -18,11 +17,8 @@ from typer.testing import CliRunner, Result
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+def run(monkeypatch: pytest.MonkeyPatch, no_variables: None) -> Run:
     """Run a command with some variables of Pliant and no others, in an empty folder and without starting processes."""
-    for name in [name for name in os.environ if name.startswith("PLIANT_")]:
-        monkeypatch.delenv(name)
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "400")
 
     def never(*_: object, **__: object) -> None:
