@@ -22,6 +22,11 @@ def parser_of(doc: str | None, *, out: Path, points: int | None = None) -> argpa
     return parser
 
 
+def words(text: str) -> list[str]:
+    """Return the words of an option's value, separated by commas."""
+    return [word for word in text.split(",") if word]
+
+
 def machine() -> str:
     """Return architecture and number of cores."""
     return f"{platform.machine()}, {os.cpu_count()} cores"

@@ -29,7 +29,6 @@ OLDEST_PYTHON = (3, 11)
 LITTLE_SPACE = 2 * 1024**3
 """Free bytes below which large jobs may not fit."""
 
-SERVER = ("fastapi", "uvicorn", "redis", "rq", "obstore", "python-multipart")
 EXTRAS = {"matplotlib": "result.plot()"}
 
 Verdict = Literal["good", "note", "bad"]
@@ -121,34 +120,42 @@ def check_python() -> Iterator[Finding]:
         yield Finding("Python", "good", found)
 
 
-def needed() -> list[str]:
-    """Return the names of the packages that Pliant needs without any extra."""
-    return [re.split(r"[^\w.-]", each, maxsplit=1)[0] for each in requires("pliant") or () if "extra ==" not in each]
+def needed(extra: str = "") -> list[str]:
+    """Return the names of the packages that an extra needs, or that Pliant needs without any."""
+    of_extra = re.compile(r'extra == "(.*)"')
+    found = [(re.split(r"[^\w.-]", each, maxsplit=1)[0], of_extra.search(each)) for each in requires("pliant") or ()]
+    return [name for name, needs in found if (needs[1] if needs else "") == extra]
 
 
-def check_packages(version_of: Callable[[str], str] = version) -> Iterator[Finding]:
-    """Check the packages that Pliant needs or can use."""
-    missing, held = [], []
-    for name in needed():
+def split_installed(names: list[str], version_of: Callable[[str], str]) -> tuple[str, str]:
+    """Return the installed packages with their versions, and the others."""
+    held, missing = [], []
+    for name in names:
         try:
             held.append(f"{name} {version_of(name)}")
         except PackageNotFoundError:
             missing.append(name)
-    if len(missing) > 0:
+    return ", ".join(held), ", ".join(missing)
+
+
+def check_packages(version_of: Callable[[str], str] = version) -> Iterator[Finding]:
+    """Check the packages that Pliant needs or can use."""
+    held, missing = split_installed(needed(), version_of)
+    if missing:
         yield Finding(
             "packages",
             "bad",
-            f"missing: {', '.join(missing)}",
+            f"missing: {missing}",
             "Reinstall: pip install --force-reinstall . in Pliant's source folder",
         )
     else:
-        yield Finding("packages", "good", ", ".join(held))
+        yield Finding("packages", "good", held)
     absent = missing_modules()
     if absent:
         advice = "Only needed to run a service: pip install '.[server]' in Pliant's source folder"
         yield Finding("server", "note", f"missing: {', '.join(absent)}", advice)
     else:
-        yield Finding("server", "good", ", ".join(f"{name} {version_of(name)}" for name in SERVER))
+        yield Finding("server", "good", split_installed(needed("server"), version_of)[0])
     for name, purpose in EXTRAS.items():
         try:
             yield Finding(name, "good", version_of(name))

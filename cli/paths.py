@@ -224,7 +224,7 @@ def output_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FI
 
 def different_files(job: Job, folder: Path, only: list[str] | None = None) -> list[str]:
     """Return the files of a job that a folder contains with different content, which a download would replace."""
-    from pliant.client.multipart import sha256
+    from pliant.schemas.digests import sha256
 
     wanted = [artifact for artifact in job.artifacts if only is None or artifact.name in only]
     return [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -210,9 +209,3 @@ def checked_options(options: Options | Mapping[str, Any] | None) -> Options:
 def option_fields(options: Options | Mapping[str, Any] | None) -> dict[str, str]:
     """Return the form fields of a job's options. Raises as `checked_options`."""
     return {"options": checked_options(options).model_dump_json(exclude_unset=True)}
-
-
-def sha256(path: Path) -> str:
-    """Hash a file without loading it into memory."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager
 from importlib.metadata import version
 
 from fastapi import Depends, FastAPI
+from pliant.schemas.digests import REPR_DIGEST
 from pliant.service import openapi, problems
 from pliant.service.dependencies import Service, known_parameters
 from pliant.service.event_stream import Followers
@@ -115,13 +116,13 @@ def middleware(settings: ServiceSettings, tokens: Tokens, metrics: Metrics, reco
                     *("Authorization", "Content-Type", "Idempotency-Key", "Last-Event-ID", "Prefer", "Range"),
                     *("If-Match", "If-None-Match", "If-Range"),
                     REQUEST_ID_HEADER,
-                    *("Repr-Digest", "Upload-Complete", "Upload-Length", "Upload-Offset"),
+                    *(REPR_DIGEST, "Upload-Complete", "Upload-Length", "Upload-Offset"),
                 ],
                 expose_headers=[
                     "Location",
                     "ETag",
                     "Content-Range",
-                    "Repr-Digest",
+                    REPR_DIGEST,
                     "Retry-After",
                     "Preference-Applied",
                     REQUEST_ID_HEADER,

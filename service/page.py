@@ -15,16 +15,14 @@ from starlette.types import Scope
 
 BUILT = Path(__file__).parent / "web" / "dist"
 
-HEADERS = {
+POLICY = {
     "Content-Security-Policy": (
         "default-src 'self'; img-src 'self' data:; media-src 'self' blob:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'; "
         "object-src 'none'"
     ),
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-    "Cross-Origin-Opener-Policy": "same-origin",
 }
-"""No inline script or style, nothing from another host; the icons in Swagger UI's stylesheet are `data:` images."""
+"""No inline script or style, nothing from another host; the icons in Swagger UI's stylesheet are `data:` images. `SecurityHeaders` adds
+the other headers."""
 
 MEDIA_TYPES = {
     ".css": "text/css; charset=utf-8",
@@ -58,7 +56,7 @@ class PageFiles(StaticFiles):
         media_type = MEDIA_TYPES.get(path.suffix)
         if media_type is None:
             raise HTTPException(404)
-        headers = HEADERS | {
+        headers = POLICY | {
             "Cache-Control": REVALIDATE if path.suffix == ".html" else IMMUTABLE,
             "Vary": "Accept-Encoding",
         }
@@ -72,7 +70,7 @@ class PageFiles(StaticFiles):
         if self.is_not_modified(response.headers, requested):
             unchanged = NotModifiedResponse(response.headers)
             # Browsers replace their stored headers by those of the 304, so it must include the page's policy.
-            unchanged.headers.update(HEADERS)
+            unchanged.headers.update(POLICY)
             return unchanged
         return response
 
@@ -87,7 +85,7 @@ def mount_page(app: FastAPI, directory: Path = BUILT) -> None:
             try:
                 return await files.get_response(name, request.scope)
             except HTTPException:
-                return HTMLResponse(NOT_BUILT, status_code=503, headers=HEADERS | {"Cache-Control": "no-store"})
+                return HTMLResponse(NOT_BUILT, status_code=503, headers=POLICY)
 
         return answer
 

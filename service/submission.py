@@ -118,7 +118,7 @@ def accept(
         canonical = folder / "canonical.npz"
         films = FilmBounds.of(jobs.settings, max_bytes=limits.max_bytes)
         read = read_form(form, options, limits, films=films, target=canonical)
-    return jobs.submit_once(canonical, replace(submission, options=read.options), interpretation=read.interpretation)
+    return jobs.submit(canonical, replace(submission, options=read.options), interpretation=read.interpretation)
 
 
 @dataclass(frozen=True)

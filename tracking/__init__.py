@@ -22,9 +22,10 @@ except ImportError as error:
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from pliant.schemas.film_limits import FilmLimits
+
 if TYPE_CHECKING:
     from pliant.tracking.decoding.film import Film, Frame, open_film
-    from pliant.tracking.decoding.limits import FilmLimits
     from pliant.tracking.errors import FilmError, TrackingError, TrackingStopped
     from pliant.tracking.records import FilmInfo, OnStep, TrackedFilm, TrackingStep
     from pliant.tracking.track import track_film
@@ -33,7 +34,6 @@ del _cv2
 
 _HOMES = {
     "decoding.film": ("Film", "Frame", "open_film"),
-    "decoding.limits": ("FilmLimits",),
     "errors": ("FilmError", "TrackingError", "TrackingStopped"),
     "records": ("FilmInfo", "OnStep", "TrackedFilm", "TrackingStep"),
     "track": ("track_film",),

@@ -10,13 +10,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pliant.schemas.film_limits import FilmLimits
 from pliant.solver.threads import available_cores, serial_blas
 from pliant.tracking.advice import warnings_before, warnings_of, warnings_unread
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.chaining import FIRST_SPACING, Chain, OnFrame, chain
 from pliant.tracking.contact_sheet import View, view_of
 from pliant.tracking.decoding.film import RATES, Film, open_film
-from pliant.tracking.decoding.limits import FilmLimits
 from pliant.tracking.errors import FILM_SLOWLY, FilmError, TrackingStopped
 from pliant.tracking.flow import Bools, Floats, Grey, opencv_serial
 from pliant.tracking.frame_store import FrameStore

@@ -126,7 +126,7 @@ class Event(NamedTuple):
     """JSON of the `Job` or of its `Progress`."""
 
 
-class Beat(NamedTuple):
+class Heartbeat(NamedTuple):
     """The heartbeat count of a job, with further fields for the reconciler."""
 
     attempt_id: str
@@ -291,7 +291,7 @@ class Records(ABC):
         """Return the job's status without a heartbeat, None if the attempt no longer owns the job."""
 
     @abstractmethod
-    def beats(self, ids: Iterable[str]) -> dict[str, Beat]:
+    def beats(self, ids: Iterable[str]) -> dict[str, Heartbeat]:
         """Return the heartbeat counts of the jobs that exist."""
 
     @abstractmethod

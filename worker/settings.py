@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import quote
 
+from pliant.schemas.film_limits import FilmLimits
 from pliant.worker.control_group import group_files
 from pliant.worker.environment import read, variable_of
 from pliant.worker.paths import socket_path
@@ -105,13 +106,15 @@ class Settings:
     film_memory: int = Field(default=4 << 30, ge=512 << 20, description="a whole number of bytes, at least 512 MiB")
     """Limit on the address space of the process that decodes and tracks a film; films that need more are rejected as too_large."""
 
-    film_frames: int = Field(default=3600, ge=3)
+    film_frames: int = Field(default=FilmLimits().frames, ge=3)
     """Maximum number of tracked frames per film."""
 
-    film_pixels: int = Field(default=4096 * 2304, ge=256)
+    film_pixels: int = Field(default=FilmLimits().pixels, ge=256)
     """Maximum width times height of a film, in pixels."""
 
-    film_seconds: float = Field(default=600.0, ge=1, allow_inf_nan=False, description="a number of seconds, at least 1")
+    film_seconds: float = Field(
+        default=FilmLimits().seconds, ge=1, allow_inf_nan=False, description="a number of seconds, at least 1"
+    )
     """Maximum playing time of a film up to the last tracked frame."""
 
     upload_expiry: Seconds = 86400.0

@@ -140,7 +140,7 @@ class Tokens:
         id = text.removeprefix(PREFIX)[:12]
         now = self._clock()
         token = Token(
-            id=id, name=label, scopes=tuple(dict.fromkeys(scopes)), owner=owner or id, sha256=_digest(text),
+            id=id, name=label, scopes=tuple(dict.fromkeys(scopes)), owner=owner or id, sha256=digest_of(text),
             created_at=now, expires_at=None if expires is None else now + expires, max_body_bytes=max_body_bytes,
             max_queued=max_queued, max_running=max_running, requests_per_minute=requests_per_minute,
         )  # fmt: skip
@@ -164,7 +164,7 @@ class Tokens:
         if form is None:
             return None
         token = self._record(form[1])
-        return token if token is not None and hmac.compare_digest(token.sha256, _digest(text)) else None
+        return token if token is not None and hmac.compare_digest(token.sha256, digest_of(text)) else None
 
     def get(self, id: str) -> Token:
         """Return a token's record.
@@ -231,5 +231,6 @@ def parse_duration(text: str) -> timedelta:
     return lasting
 
 
-def _digest(text: str) -> str:
+def digest_of(text: str) -> str:
+    """Return what is stored of a secret."""
     return hashlib.sha256(text.encode()).hexdigest()

@@ -96,12 +96,11 @@ def span(name: str, *, parent: str | None = None, **attributes: str | int | floa
         yield current
 
 
-def past(name: str, *, begin: datetime, end: datetime, **attributes: str | int | float) -> None:
+def past(name: str, *, begin: datetime, end: datetime) -> None:
     """Add a span for an interval that has ended, such as the wait in the queue."""
     if _provider is not None:
-        named = {f"pliant.{key}": value for key, value in attributes.items()}
         tracer = _provider.get_tracer("pliant")
-        tracer.start_span(name, start_time=_nanoseconds(begin), attributes=named).end(end_time=_nanoseconds(end))
+        tracer.start_span(name, start_time=_nanoseconds(begin)).end(end_time=_nanoseconds(end))
 
 
 def traceparent() -> str | None:

@@ -28,7 +28,7 @@ from benchmarks.accuracy.plan import PARTS
 from benchmarks.accuracy.summary import write_summary
 from benchmarks.accuracy.tables import METRICS, clean_table, corruption_table, number
 from benchmarks.commit import commit
-from benchmarks.rows import append_row
+from benchmarks.rows import append_row, words
 from benchmarks.sequences import Case, cases, wanted
 
 SLOW = 10.0
@@ -131,9 +131,6 @@ def tables(options: argparse.Namespace, visibility: str, metrics: Iterable[str])
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-
-    def words(text: str) -> list[str]:
-        return [word for word in text.split(",") if word]
 
     parser.add_argument("--data", type=Path, help="directory of sequences; the gallery when not given")
     parser.add_argument("--points", type=int, help="thin every sequence to so many points, keeping a mesh")

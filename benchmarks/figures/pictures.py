@@ -27,6 +27,7 @@ from pliant.solver.model.so3 import nearest
 
 from benchmarks.accuracy.cells import parse_settings
 from benchmarks.figures.shading import draw_mesh, draw_points
+from benchmarks.rows import words
 from benchmarks.sequences import Case, cases
 
 mpl.use("Agg")
@@ -136,8 +137,8 @@ def picture(
             row[-1].text(
                 0.98, 0.02, f"{scene.relative[frame]:.3f}", transform=row[-1].transAxes, ha="right", fontsize=9
             )
-    for cell, words in zip(axes[0], titles, strict=True):
-        cell.set_title(words, fontsize=10)
+    for cell, title in zip(axes[0], titles, strict=True):
+        cell.set_title(title, fontsize=10)
     scalar = mpl.cm.ScalarMappable(mpl.colors.Normalize(0, full), colours)
     figure.colorbar(scalar, ax=axes, shrink=0.6, label=f"{scene.quantity}, % of the RMS radius")
     figure.suptitle(title, fontsize=10)
@@ -184,9 +185,6 @@ def _turn(degrees: float) -> np.ndarray:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-
-    def words(text: str) -> list[str]:
-        return [word for word in text.split(",") if word]
 
     parser.add_argument("--data", type=Path)
     parser.add_argument("--points", type=int)

@@ -166,7 +166,7 @@ def _failed(settings: Settings) -> str:
     with tempfile.NamedTemporaryFile() as file:
         file.write(b"x")
         file.flush()
-        id = jobs.submit(Path(file.name), Submission(options=Options()), interpretation=stated).id
+        id = jobs.submit(Path(file.name), Submission(options=Options()), interpretation=stated)[0].id
     jobs.cancel(id)
     return id
 

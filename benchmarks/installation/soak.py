@@ -78,7 +78,7 @@ class Soak:
         """Submit one job; a submission refused while a store restarts is not a loss."""
         options = Options(max_reweightings=self.random.choice((2, 10, 40)), tolerance=1e-12)
         try:
-            job = self.jobs.submit(self.inputs, Submission(options=options), interpretation=self.interpretation)
+            job = self.jobs.submit(self.inputs, Submission(options=options), interpretation=self.interpretation)[0]
         except StoreUnavailable:
             self.refused += 1
         else:

@@ -22,6 +22,7 @@ import shlex
 import sys
 from pathlib import Path
 
+from benchmarks.rows import words
 from benchmarks.speed.blas_threads import blas_threads
 from benchmarks.speed.growth import FIXED_FRAMES, FIXED_POINTS, FRAMES, POINTS, Sizes, growth, mesh_against_grid
 from benchmarks.speed.side_by_side import BASELINES, Workload, compare
@@ -60,9 +61,6 @@ def command_of(arguments: list[str]) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-
-    def words(text: str) -> list[str]:
-        return [word for word in text.split(",") if word]
 
     def sizes(text: str) -> tuple[int, ...]:
         return tuple(int(word) for word in words(text))

@@ -174,7 +174,7 @@ class Batch:
             The service does not answer.
         """
         from pliant.client.errors import NotAuthorized, PliantError, Unreachable
-        from pliant.client.multipart import sha256
+        from pliant.schemas.digests import sha256
         from pliant.schemas.job import Status
 
         submitted: list[tuple[Row, RemoteJob]] = []
@@ -269,7 +269,7 @@ class Batch:
 
     def _common(self, secret: str | None) -> str:
         """Return the parameters that all files share as text; mesh, ground truth, rotations and secret by their digests."""
-        from pliant.client.multipart import sha256
+        from pliant.schemas.digests import sha256
 
         parts = {name: None if part is None else str(part) for name, part in self.shared.items()}
         for name in ("mesh", "ground_truth", "rotations"):

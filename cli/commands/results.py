@@ -28,7 +28,7 @@ def view(
     require_server("pliant view")
     import uvicorn
     from pliant.client.errors import BadArgument
-    from pliant.service.routes.local_result import create_viewer
+    from pliant.service.local_result import create_viewer
 
     if not result.exists():
         raise BadArgument(f"result: {result} does not exist. Name the folder that `pliant solve -o` wrote.")

@@ -12,8 +12,9 @@ from pliant.client._async.transport import Exchange
 from pliant.client.call import Call
 from pliant.client.errors import CorruptDownload
 from pliant.client.locks import lock
-from pliant.client.multipart import OnBytes, sha256
+from pliant.client.multipart import OnBytes
 from pliant.client.pauses import async_sleep, in_thread
+from pliant.schemas.digests import sha256
 from pliant.schemas.job import Artifact
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,9 +14,10 @@ from pliant.client import multipart
 from pliant.client._async.transport import Exchange, parse, read, refusal
 from pliant.client.call import Call
 from pliant.client.errors import APIStatusError, NotFound, PliantError, TooManyRequests
-from pliant.client.multipart import Form, Remainder, sha256
+from pliant.client.multipart import Form, Remainder
 from pliant.client.pauses import async_sleep, in_thread
 from pliant.client.retry import OUT_OF_STEP
+from pliant.schemas.digests import REPR_DIGEST, repr_digest, sha256
 from pliant.schemas.job import Upload
 
 
@@ -53,7 +53,6 @@ async def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str,
     Each stored byte counts as success, so the client does not give up on a poor connection that makes progress.
     """
     attempts, size, reached = exchange.attempts, path.stat().st_size, 0
-    encoded = base64.b64encode(bytes.fromhex(digest)).decode()
     known: Upload | None = None
     while True:
         held = known or await _state(exchange, upload_id)
@@ -63,7 +62,7 @@ async def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str,
         if held.offset > reached:
             reached = held.offset
             attempts.succeeded()
-        headers = {"Upload-Offset": str(held.offset), "Upload-Length": str(size), "Repr-Digest": f"sha-256=:{encoded}:"}
+        headers = {"Upload-Offset": str(held.offset), "Upload-Length": str(size), REPR_DIGEST: repr_digest(digest)}
         body = Remainder(path=path, offset=held.offset, report=report)
         call = Call(method="PUT", path=_path(upload_id), headers=headers, body=body)
         fault: Exception

@@ -13,8 +13,9 @@ from pliant.client._sync.transport import Exchange
 from pliant.client.call import Call
 from pliant.client.errors import CorruptDownload
 from pliant.client.locks import lock
-from pliant.client.multipart import OnBytes, sha256
+from pliant.client.multipart import OnBytes
 from pliant.client.pauses import in_place, sleep
+from pliant.schemas.digests import sha256
 from pliant.schemas.job import Artifact
 
 

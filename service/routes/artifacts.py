@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterator
 from itertools import chain
 from typing import Annotated
 
 from fastapi import Path, Query, Request
 from fastapi.responses import RedirectResponse, Response, StreamingResponse
+from pliant.schemas.digests import REPR_DIGEST, repr_digest
 from pliant.schemas.job import Artifact
 from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Core, Mine
@@ -89,7 +89,7 @@ def artifact(id: Id, name: Name, request: Request, jobs: Mine, core: Core, redir
     headers |= {
         "Content-Length": str(part.length),
         "Content-Disposition": f'attachment; filename="{about.name}"',
-        "Repr-Digest": f"sha-256=:{base64.b64encode(bytes.fromhex(about.sha256)).decode()}:",
+        REPR_DIGEST: repr_digest(about.sha256),
     }
     if part.status == 206:
         headers["Content-Range"] = f"bytes {part.start}-{part.start + part.length - 1}/{size}"

@@ -64,7 +64,7 @@ async def preferences(
 Prefer = Annotated[str | None, Depends(preferences)]
 _WAIT = re.compile(r"\s*wait\s*=\s*(\d{1,15})\s*", re.IGNORECASE)
 _SUBMIT_ERRORS = problems(400, 401, 403, 404, 408, 409, 413, 415, 422, 429, 503, 507)
-_LOCATION = {"Location": {"description": "The job's address.", "schema": {"type": "string"}}}
+LOCATION = {"Location": {"description": "The job's address.", "schema": {"type": "string"}}}
 
 
 @router.post(
@@ -72,7 +72,7 @@ _LOCATION = {"Location": {"description": "The job's address.", "schema": {"type"
     status_code=202,
     operation_id="submit_job",
     summary="Submit a job",
-    responses={202: {"headers": _LOCATION, "content": JOB_EXAMPLE}, **_SUBMIT_ERRORS},
+    responses={202: {"headers": LOCATION, "content": JOB_EXAMPLE}, **_SUBMIT_ERRORS},
     openapi_extra={"requestBody": SUBMIT_BODY},
 )
 async def submit(
@@ -93,7 +93,7 @@ async def submit(
     operation_id="put_job",
     summary="Submit a job under your own id",
     responses={
-        202: {"headers": _LOCATION, "content": JOB_EXAMPLE},
+        202: {"headers": LOCATION, "content": JOB_EXAMPLE},
         200: {"model": Job, "description": "An earlier, equal request created this job."},
         **_SUBMIT_ERRORS,
     },
@@ -156,7 +156,7 @@ def cancel(id: Id, jobs: Mine) -> Job:
     status_code=202,
     operation_id="retry_job",
     summary="Run a failed or cancelled job again",
-    responses={202: {"headers": _LOCATION}, **problems(401, 403, 404, 409, 422, 429, 503, 507)},
+    responses={202: {"headers": LOCATION}, **problems(401, 403, 404, 409, 422, 429, 503, 507)},
 )
 def retry(id: Id, response: Response, jobs: Mine, key: Key) -> Job:
     """Queue a new job with the same inputs, options and name; its `retry_of` is the id of the old one."""

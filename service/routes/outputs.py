@@ -8,13 +8,11 @@ from pliant.schemas.job import Job
 from pliant.schemas.outputs import OutputRequest
 from pliant.service.dependencies import Mine
 from pliant.service.openapi import problems
-from pliant.service.routes.jobs import Id, Key
+from pliant.service.routes.jobs import LOCATION, Id, Key
 from pliant.service.routes.json_body import body_of, read_json
 from pliant.worker.jobs.further_outputs import make_outputs
 
 router = APIRouter(prefix="/v1/jobs/{id}/outputs", tags=["jobs"])
-
-_LOCATION = {"Location": {"description": "The new job's address.", "schema": {"type": "string"}}}
 
 
 @router.post(
@@ -23,7 +21,7 @@ _LOCATION = {"Location": {"description": "The new job's address.", "schema": {"t
     operation_id="make_outputs",
     summary="Write further files of a result",
     responses={
-        202: {"headers": _LOCATION},
+        202: {"headers": LOCATION},
         200: {"model": Job, "description": "An earlier, equal request created this job."},
         **problems(400, 401, 403, 404, 409, 413, 415, 422, 429, 503, 507),
     },

@@ -19,6 +19,7 @@ from typing import Annotated, Literal
 import anyio
 from anyio import to_thread
 from fastapi import APIRouter, Header, Path, Request, Response
+from pliant.schemas.digests import REPR_DIGEST, repr_digest
 from pliant.schemas.job import Upload
 from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Bound, Bounds, Core, MyUploads, Service, bounds_of
@@ -53,7 +54,7 @@ Length = Annotated[
 ]
 Digest = Annotated[
     str | None,
-    Header(alias="Repr-Digest", max_length=500, description="`sha-256=:BASE64:` of the whole; checked at the end."),
+    Header(alias=REPR_DIGEST, max_length=500, description="`sha-256=:BASE64:` of the whole; checked at the end."),
 ]
 _STATE = {
     "Upload-Offset": {"description": "Bytes received.", "schema": {"type": "integer"}},
@@ -262,7 +263,7 @@ def _sha256(digest: str | None) -> str | None:
     if len(value) != 32:
         expected, got, hint = "sha-256=:BASE64 of 32 bytes:", digest[:80], "Encode the raw digest, or leave it out."
         code = ProblemCode.INVALID_DIGEST
-        raise wrong_input(code, field="Repr-Digest", expected=expected, got=got, hint=hint)
+        raise wrong_input(code, field=REPR_DIGEST, expected=expected, got=got, hint=hint)
     return value.hex()
 
 
@@ -275,4 +276,4 @@ def _describe(response: Response, upload: Upload, bounds: Bounds, uploads: Uploa
     age = f", max-age={int(uploads.expiry)}" if uploads.expiry > 0 else ""
     headers["Upload-Limit"] = f"max-size={bounds.max_upload_bytes}{age}"
     if upload.sha256 is not None:
-        headers["Repr-Digest"] = f"sha-256=:{base64.b64encode(bytes.fromhex(upload.sha256)).decode()}:"
+        headers[REPR_DIGEST] = repr_digest(upload.sha256)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from typing import IO, Any
 import httpx
 import numpy as np
 import pytest
+from commands import CLEAN
 from pliant.cli.demo import GOOD, judge, running
 from pliant.solver.gallery import corrupt, face
 from pliant.worker.jobs.service import Jobs
@@ -22,15 +22,13 @@ from pliant.worker.settings import Settings
 
 pytestmark = pytest.mark.slow
 
-ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
-
 
 def pliant(*arguments: object, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "pliant.cli", *map(str, arguments)]
     return subprocess.run(
         command,
         cwd=folder,
-        env={**ENVIRONMENT, **environment},
+        env={**CLEAN, **environment},
         capture_output=True,
         text=True,
         timeout=240,
@@ -45,7 +43,7 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
 
 def test_demo_writes_a_result_judges_it_and_stops_on_sigint(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pliant.cli", "demo", "--small", "--keep", "--json"]
-    process = subprocess.Popen(command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, cwd=tmp_path, env=CLEAN, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     printed = document(process.stdout)
     assert printed["job"]["status"] == "succeeded"
@@ -85,7 +83,7 @@ def test_work_serves_a_queue_until_it_is_stopped(tmp_path: Path) -> None:
     valkey = Valkey.claim(tmp_path)
     server = valkey.start()
     command = [sys.executable, "-m", "pliant.cli", "work", "--data", str(tmp_path), "--workers", "1", "--json"]
-    process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, env=CLEAN, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
         assert document(process.stdout) == {"workers": 1, "queue": "pliant"}

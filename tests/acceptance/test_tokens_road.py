@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browsing import Browsing, why_not
+from commands import CLEAN
 from long_jobs import long_request
 from pliant.cli.demo import read_address
 from pliant.cli.exits import Exit
@@ -31,7 +32,6 @@ QUICK = {"camera": "orthographic", "surface": "free", "prior": "smooth", "refine
 """Options of a short job: the default takes ten times as long, and the result does not matter here."""
 
 QUICKLY = [text for name, value in QUICK.items() for text in ("-O", f"{name}={str(value).lower()}")]
-CLEAN = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
 
 
 def pliant(*arguments: object, token: str = "", **env: str) -> subprocess.CompletedProcess[str]:

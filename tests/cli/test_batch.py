@@ -6,26 +6,19 @@ import importlib
 import json
 import math
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from commands import Run, words
 from pliant.cli import app
 from pliant.cli.exits import Exit
 from pliant.cli.session import Session
 from pliant.client import BadArgument, Client, RemoteJob
 from pliant.schemas.job import LONGEST_NAME
 from pliant.service.testing import InMemoryService
-from typer.testing import CliRunner, Result
-
-Run = Callable[..., Result]
-
-
-@pytest.fixture
-def service() -> InMemoryService:
-    return InMemoryService(steps=1)
+from typer.testing import CliRunner
 
 
 @pytest.fixture
@@ -261,10 +254,6 @@ def test_a_priority_reaches_the_job(run: Run, takes: Path) -> None:
     ran = run("submit", takes / "take-0.npz", "--mesh", "none", "--priority", "high", "--json")
     assert json.loads(ran.stdout)["priority"] == "high"
     assert run("submit", takes / "take-0.npz", "--priority", "urgent").exit_code == Exit.USAGE
-
-
-def words(ran: Result) -> str:
-    return " ".join(ran.stderr.split())
 
 
 def test_ids_are_printed_at_submission_and_progress_while_waiting(

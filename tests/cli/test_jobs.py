@@ -6,29 +6,23 @@ import errno
 import json
 import math
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from commands import Run
 from PIL import Image
 from pliant.cli import app
 from pliant.cli.exits import Exit, code_of
 from pliant.cli.session import Session
 from pliant.client import Client, Problem
 from pliant.service.testing import InMemoryService
-from typer.testing import CliRunner, Result
+from typer.testing import CliRunner
 
 FAULT = Problem(
     title="Lost", status=500, code="worker_lost", detail="The worker vanished. Retry the job.", retryable=True
 )
-Run = Callable[..., Result]
-
-
-@pytest.fixture
-def service() -> InMemoryService:
-    return InMemoryService(steps=1)
 
 
 @pytest.fixture
@@ -36,13 +30,6 @@ def endless(run: Run, service: InMemoryService, tracks: Path) -> None:
     """Occupy the worker until the end of the test, so that further jobs stay queued."""
     service.worker.steps = math.inf
     submitted(run, tracks, "--id", "endless")
-
-
-@pytest.fixture
-def tracks(tmp_path: Path) -> Path:
-    path = tmp_path / "tracks.npz"
-    np.savez(path, tracks=np.random.default_rng(0).normal(size=(5, 12, 2)))
-    return path
 
 
 def submitted(run: Run, tracks: Path, *more: object) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import io
 import json
-import os
 import re
 import socket
 import subprocess
@@ -205,6 +204,8 @@ def test_doctor_reports_missing_packages(monkeypatch: pytest.MonkeyPatch) -> Non
     broken = list(doctor.check_packages(without("scipy", "clarabel", "matplotlib")))
     assert verdicts(broken) == {"packages": "bad", "server": "good", "matplotlib": "note"}
     assert broken[0].found == "missing: clarabel, scipy"
+    server = next(each for each in doctor.check_packages(without("uvloop")) if each.what == "server")
+    assert f"rq {version('rq')}, uvicorn {version('uvicorn')}" in server.found, "without uvloop, which Windows lacks"
     monkeypatch.setattr(doctor, "OLDEST_PYTHON", (4, 0))
     assert verdicts(doctor.check_python()) == {"Python": "bad"}
 
@@ -313,11 +314,8 @@ def test_long_paths_are_folded_and_not_cut_off(capsys: pytest.CaptureFixture[str
 
 
 def test_doctor_and_fsck_read_env_and_secret_files_as_the_service_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_variables: None
 ) -> None:
-    for name in [name for name in os.environ if name.startswith("PLIANT_")]:
-        monkeypatch.delenv(name)
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PLIANT_SECRETS_DIR", str(tmp_path))
     (tmp_path / "there" / "valkey").mkdir(parents=True)
     port = free_port()

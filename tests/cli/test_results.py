@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +14,17 @@ import httpx
 import numpy as np
 import pytest
 import trimesh
+from commands import Run
 from fastapi.testclient import TestClient
 from pliant.cli import app
 from pliant.cli.exits import Exit
 from pliant.cli.session import Session
-from pliant.service.routes.local_result import create_viewer, read_result
+from pliant.service.local_result import create_viewer, read_result
 from pliant.service.testing import InMemoryService
 from pliant.worker.artifacts import build_report, write_artifacts
 from pliant.worker.errors import InvalidRequest
 from results import make_result
-from typer.testing import CliRunner, Result
-
-Run = Callable[..., Result]
+from typer.testing import CliRunner
 
 
 @pytest.fixture

@@ -11,12 +11,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Run, words
 from pliant.cli import app
 from pliant.cli.exits import Exit, code_of, sentence_of
 from pliant.cli.paths import output_file, output_folder
@@ -30,7 +31,6 @@ from pliant.worker.processes.containment import NUMERICAL_THREADS
 from serving import until
 from typer.testing import CliRunner, Result
 
-Run = Callable[..., Result]
 FAST = (
     "-m",
     "none",
@@ -63,17 +63,6 @@ def run(service: InMemoryService, monkeypatch: pytest.MonkeyPatch) -> Run:
         return CliRunner().invoke(app, [str(each) for each in arguments], obj=Session(transport=service))
 
     return run
-
-
-@pytest.fixture
-def tracks(tmp_path: Path) -> Path:
-    path = tmp_path / "tracks.npz"
-    np.savez(path, tracks=np.random.default_rng(0).normal(size=(5, 12, 2)) * 100)
-    return path
-
-
-def words(ran: Result) -> str:
-    return " ".join(ran.stderr.split())
 
 
 def refusal(sentence: str, code: str = "invalid_argument") -> str:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from commands import Run
 from pliant.cli import app
 from pliant.cli.doctor import check_memory, check_variables
 from pliant.cli.exits import Exit
@@ -16,15 +15,10 @@ from pliant.worker.processes.supervisor import Supervisor
 from pliant.worker.settings import Settings
 from typer.testing import CliRunner, Result
 
-Run = Callable[..., Result]
-
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+def run(monkeypatch: pytest.MonkeyPatch, no_variables: None) -> Run:
     """Run a command with some variables of Pliant and no others, in an empty folder and without starting processes."""
-    for name in [name for name in os.environ if name.startswith("PLIANT_")]:
-        monkeypatch.delenv(name)
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "400")
 
     def never(*_: object, **__: object) -> None:

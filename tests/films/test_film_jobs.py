@@ -22,9 +22,10 @@ import films
 import numpy as np
 import pytest
 from PIL import Image
+from pliant.schemas.film_limits import FilmLimits
 from pliant.schemas.job import Progress
 from pliant.schemas.options import Options
-from pliant.service.routes.local_result import read_result
+from pliant.service.local_result import read_result
 from pliant.solver.errors import InvalidInput
 from pliant.tracking import FilmError, open_film
 from pliant.tracking import track_film as follow
@@ -185,7 +186,8 @@ def test_a_selection_after_the_end_of_a_damaged_film_has_no_frames(tmp_path: Pat
 def test_film_limits_come_from_the_settings(film: Path) -> None:
     settings = Settings(film_frames=8, film_pixels=5000, film_seconds=2)
     bounds = FilmBounds.of(settings, max_bytes=10**6)
-    assert (bounds.max_bytes, bounds.max_frames, bounds.max_pixels, bounds.max_seconds) == (10**6, 8, 5000, 2.0)
+    assert bounds.limits == FilmLimits(bytes=10**6, frames=8, pixels=5000, seconds=2.0)
+    assert FilmBounds.of(Settings()).limits == FilmLimits()
     assert bounds.memory == settings.film_memory == FilmBounds().memory
     assert FilmBounds.of(Settings(memory_limit=1 << 30)).memory == 1 << 30
     assert FilmBounds.of(Settings(time_limit=7200)).track_seconds == 7200
@@ -212,18 +214,18 @@ def test_options_that_do_not_fit_the_film_are_rejected(film: Path, region: Path,
     assert refusal(FilmSource(film, region), outside).code == "conflicting_parts"
     assert refusal(FilmSource(film), Options(frames="-5:")).field == "options.frames"
     assert refusal(FilmSource(film), Options(frames="50:60")).code == "too_few_frames"
-    assert refusal(FilmSource(film), bounds=FilmBounds(max_pixels=1000)).code == "too_many_pixels"
-    assert refusal(FilmSource(film), bounds=FilmBounds(max_bytes=1000)).code == "too_many_bytes"
+    assert refusal(FilmSource(film), bounds=FilmBounds(limits=FilmLimits(pixels=1000))).code == "too_many_pixels"
+    assert refusal(FilmSource(film), bounds=FilmBounds(limits=FilmLimits(bytes=1000))).code == "too_many_bytes"
     for name, value in (("region_frame", 1000), ("template_frame", 1000), ("grid_step", 1.0)):
         wrong = refusal(FilmSource(film), Options(longest_side=64, **{name: value}))
         assert wrong.field == f"options.{name}"
         assert wrong.code == ("out_of_range" if name == "grid_step" else "no_such_frame")
     assert refusal(FilmSource(film), Options(frames="2:8", template_frame=1)).field == "options.template_frame"
-    far = refusal(FilmSource(film, region), Options(frames="6:"), FilmBounds(max_frames=5))
+    far = refusal(FilmSource(film, region), Options(frames="6:"), FilmBounds(limits=FilmLimits(frames=5)))
     assert (far.code, far.field) == ("too_many_frames", "options.region_frame")
     pictures = {f"{number}.png": films.png(each) for number, each in enumerate(films.textured_pictures(4))}
     many = films.zip_of(tmp_path / "many.zip", pictures)
-    assert refusal(FilmSource(many), bounds=FilmBounds(max_frames=3)).code == "too_many_frames"
+    assert refusal(FilmSource(many), bounds=FilmBounds(limits=FilmLimits(frames=3))).code == "too_many_frames"
 
 
 def test_too_little_memory_or_time_is_an_input_error(film: Path, tmp_path: Path) -> None:

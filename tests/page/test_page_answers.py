@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import time
 from typing import Any
 
 import httpx
 import pytest
-from browsing import heard, why_not
-from paging import TRACKS, choose, refresh, until
+from browsing import NEEDS_CHROMIUM, heard
+from paging import TRACKS, choose, record, refresh, until
 from playwright.sync_api import Dialog, Page, Route, expect
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
+pytestmark = NEEDS_CHROMIUM
 
 LIST = re.compile(r"/v1/jobs\?")
 HTML = {"content_type": "text/html", "body": "<html><h1>Bad gateway</h1></html>"}
@@ -28,10 +24,6 @@ def problem(status: int, code: str, **rest: Any) -> dict[str, Any]:
         "status": status,
         "json": {"title": "Refused", "status": status, "detail": "It is so.", "code": code, **rest},
     }
-
-
-def record(url: str, of: str, **changes: Any) -> dict[str, Any]:
-    return {**httpx.get(f"{url}/v1/jobs/{of}").json(), **changes}
 
 
 def test_a_job_is_followed_through_unreadable_answers(page: Page, url: str, finished: str) -> None:

@@ -8,9 +8,18 @@ from pathlib import Path
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
+from pliant.service.middleware.security_headers import SecurityHeaders
 from pliant.service.page import mount_page
+from starlette.middleware import Middleware
 
 SCRIPT = "export const answer = 42;\n"
+
+
+def served(folder: Path) -> TestClient:
+    """The page of a folder, with the headers that the service adds to every response."""
+    app = FastAPI(docs_url=None, middleware=[Middleware(SecurityHeaders)])
+    mount_page(app, folder)
+    return TestClient(app)
 
 
 @pytest.fixture
@@ -20,9 +29,7 @@ def built(tmp_path: Path) -> TestClient:
         (tmp_path / name).write_text(text)
         (tmp_path / f"{name}.gz").write_bytes(gzip.compress(text.encode()))
     (tmp_path / "notes.txt").write_text("not a part of the page")
-    app = FastAPI(docs_url=None)
-    mount_page(app, tmp_path)
-    return TestClient(app)
+    return served(tmp_path)
 
 
 def test_the_page_is_revalidated_and_its_files_are_immutable(built: TestClient) -> None:
@@ -77,18 +84,14 @@ def test_head_returns_the_same_headers_without_a_body(built: TestClient) -> None
 
 @pytest.mark.parametrize("address", ["/", "/docs", "/guide"])
 def test_a_missing_page_returns_503_with_build_instructions(tmp_path: Path, address: str) -> None:
-    app = FastAPI(docs_url=None)
-    mount_page(app, tmp_path / "absent")
-    answer = TestClient(app).get(address)
+    answer = served(tmp_path / "absent").get(address)
     assert answer.status_code == 503
     assert "<code>make page</code>" in answer.text
     assert answer.headers["cache-control"] == "no-store"
 
 
 def test_a_page_built_later_is_served_without_a_restart(tmp_path: Path) -> None:
-    app = FastAPI(docs_url=None)
-    mount_page(app, tmp_path)
-    client = TestClient(app)
+    client = served(tmp_path)
     assert client.get("/").status_code == 503
     (tmp_path / "index.html").write_text("<!doctype html><title>Pliant</title>")
     assert client.get("/").text == "<!doctype html><title>Pliant</title>"

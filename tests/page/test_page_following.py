@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
 
 import httpx
-import pytest
-from browsing import heard, why_not
+from browsing import NEEDS_CHROMIUM, heard
 from paging import DONE, refresh, steps_of, until
 from playwright.sync_api import Page, Route, expect
 from pliant.client import Client
 from pliant.solver import gallery
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
+pytestmark = NEEDS_CHROMIUM
 
 
 def test_a_running_job_survives_a_reload_and_can_be_cancelled(

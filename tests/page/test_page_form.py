@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import re
 import zipfile
 from pathlib import Path
 
 import httpx
 import pytest
-from browsing import why_not
+from browsing import AXE, NEEDS_CHROMIUM
 from paging import TRACKS, choose, drop
 from playwright.sync_api import Page, expect
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
-AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
+pytestmark = NEEDS_CHROMIUM
 SOON = 60_000
 
 

@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 from typing import Any
 
 import httpx
-import pytest
-from browsing import differing_pixels, heard, why_not
-from paging import DONE, until
+from browsing import NEEDS_CHROMIUM, differing_pixels, heard
+from paging import DONE, record, until
 from playwright.sync_api import Error, Page, Route, expect
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
+pytestmark = NEEDS_CHROMIUM
 
 OTHER = "f" * 32
-
-
-def record(url: str, of: str, **changes: Any) -> dict[str, Any]:
-    return {**httpx.get(f"{url}/v1/jobs/{of}").json(), **changes}
 
 
 def release(held: list[Route]) -> None:

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import re
 
 import httpx
 import pytest
-from browsing import differing_pixels, why_not
+from browsing import NEEDS_CHROMIUM, differing_pixels
 from paging import DONE, until
 from playwright.sync_api import Page, Request, Route, expect
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
+pytestmark = NEEDS_CHROMIUM
 
 
 @pytest.mark.usefixtures("front")

@@ -17,21 +17,17 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from browsing import why_not
+from browsing import AXE, NEEDS_CHROMIUM
 from paging import DONE, seek, until
 from PIL import Image
 from playwright.sync_api import Browser, Locator, Page, expect
 from pliant.tracking.contact_sheet import small_jpeg
 from pliant.worker.artifacts import build_report, write_artifacts
-from pliant.worker.artifacts.preview import write_preview
 from pliant.worker.films.frame_strip import packed
-from results import make_result
+from results import make_result, preview_of
 from scipy.spatial.transform import Rotation
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
+pytestmark = NEEDS_CHROMIUM
 
 POINT_NAMES = tuple(f"Lid {number} ü" for number in range(21 * 31))
 GREYS = (20, 50, 80, 110, 140, 170, 200)
@@ -39,7 +35,6 @@ GREYS = (20, 50, 80, 110, 140, 170, 200)
 GREEN = (0, 255, 0)
 EDGE = 6
 """Pixels at the edge of a pane that may show what is around it, or the outline of the focus."""
-AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 QUICK_LOOK = """const supports = DOMTokenList.prototype.supports;
 DOMTokenList.prototype.supports = function (word) { return word === "ar" || supports.call(this, word); };"""
 
@@ -158,11 +153,9 @@ def off_centre_close_up() -> bytes:
         solution.camera, rotations=turned, scales=np.full(len(GREYS), 0.4), translations=np.full((len(GREYS), 2), (110.0, 100.0)),
         focal=150.0, principal_point=np.array([159.5, 89.5]),
     )  # fmt: skip
-    into = io.BytesIO()
     solution = replace(solution, camera=camera)
     tracks = replace(inputs.tracks, points=camera.project(solution.shapes))
-    write_preview(into, tracks=tracks, mesh=inputs.mesh, solution=solution, texture=inputs.texture)
-    return into.getvalue()
+    return preview_of(tracks, solution, mesh=inputs.mesh, texture=inputs.texture)
 
 
 def drawn_part(pane: Locator, *backgrounds: tuple[int, int, int]) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -15,15 +14,12 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from browsing import differing_pixels, why_not
+from browsing import NEEDS_CHROMIUM, differing_pixels
 from paging import DONE, TRACKS, seek, until
 from playwright.sync_api import Page, expect
 from pliant.solver.gallery import face
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
+pytestmark = NEEDS_CHROMIUM
 
 
 def test_each_colouring_overlay_and_view_changes_the_picture(page: Page, url: str, finished: str) -> None:

@@ -10,15 +10,11 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from browsing import differing_pixels, heard, why_not
+from browsing import NEEDS_CHROMIUM, differing_pixels, heard
 from paging import DONE, TRACKS, choose, drop, packed, seek, until
 from playwright.sync_api import Page, Route, expect
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.usefixtures("front"),
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
+pytestmark = [*NEEDS_CHROMIUM, pytest.mark.usefixtures("front")]
 
 
 def test_files_are_submitted_and_the_result_plays(page: Page, url: str, small: dict[str, bytes]) -> None:

@@ -8,20 +8,15 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Collection
-from pathlib import Path
 
 import httpx
 import pytest
-from browsing import why_not
+from browsing import AXE, NEEDS_CHROMIUM
 from paging import DONE, TRACKS, drop
 from playwright.sync_api import Page, Route, expect
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
+pytestmark = NEEDS_CHROMIUM
 
-AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 RUN = "axe.run({rules: {'target-size': {enabled: true}}}).then((found) => found.violations)"
 """Includes the WCAG 2.2 rule that axe disables by default: targets of 24 px, or as much space around them."""
 

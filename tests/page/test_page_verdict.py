@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import os
 import re
-from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from browsing import why_not
+from browsing import AXE, NEEDS_CHROMIUM
 from paging import DONE
 from playwright.sync_api import Page, Route, expect
 from pliant.solver.evaluation.trust import Trust
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
+pytestmark = NEEDS_CHROMIUM
 
-AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 TRUST = "Expected error about 3 % of the object's size; depth rests on 9° of turn."
 REASONS = ["The camera turns by 9°. Turn by 30° or more.", "12 % of the observations are hidden."]
 

@@ -12,21 +12,18 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from browsing import differing_pixels, why_not
+import results
+from browsing import AXE, NEEDS_CHROMIUM, differing_pixels
 from paging import DONE, QUICK, TRACKS, packed, seek, until
 from PIL import Image
 from playwright.sync_api import Browser, Locator, Page, expect
 from pliant.solver import KnownCamera, Solution, solve
 from pliant.solver.gallery import Sequence, corrupt, flag
-from pliant.worker.artifacts.preview import write_preview
 from pliant.worker.formats.texture import Texture
+from pliant.worker.formats.tracks.frame_times import mean_rate
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
+pytestmark = NEEDS_CHROMIUM
 
-AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 FRAMES, POINTS = 10, 300
 HALF_TURN = 24
 """Presses of an arrow key that turn the view by 180°."""
@@ -243,9 +240,7 @@ def solved() -> tuple[Sequence, Solution]:
 
 def preview_of(solved: tuple[Sequence, Solution], **given: Any) -> bytes:
     sequence, solution = solved
-    into = io.BytesIO()
-    write_preview(into, tracks=sequence.tracks, mesh=sequence.mesh, solution=solution, **given)
-    return into.getvalue()
+    return results.preview_of(sequence.tracks, solution, mesh=sequence.mesh, **given)
 
 
 def painted(solved: tuple[Sequence, Solution]) -> bytes:
@@ -263,7 +258,7 @@ def test_a_film_of_uneven_frame_rate_plays_at_its_own_times(
     seconds = np.r_[
         np.arange(FRAMES - 1) / 20, 600.0
     ]  # at the mean rate the second frame would be shown after a minute
-    preview = preview_of(solved, uneven_times=seconds)
+    preview = preview_of(solved, frame_times=seconds, fps=mean_rate(seconds))
     page.route(f"**/{jobs[0]}/**/preview.bin", lambda route: route.fulfill(body=preview))
     page.goto(f"{url}/#job={jobs[0]}")
     canvas(page).wait_for(timeout=DONE)

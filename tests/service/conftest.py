@@ -72,6 +72,12 @@ def running(serve: Serve) -> Running:
     return serve()
 
 
+@pytest.fixture(scope="module")
+def guarded(serve: Serve) -> Running:
+    """A service that requires tokens."""
+    return serve(auth="required")
+
+
 @pytest.fixture
 def http(running: Running) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=running.url, timeout=20) as client:

@@ -98,7 +98,7 @@ def options() -> Options:
 def submit(jobs: Jobs, inputs_file: Path, options: Options, interpretation: Interpretation):  # type: ignore[no-untyped-def]
     def call(door: Jobs = jobs, **more: object) -> Job:
         submission = Submission(options=options, **more)  # type: ignore[arg-type]
-        return door.submit(inputs_file, submission, interpretation=interpretation)
+        return door.submit(inputs_file, submission, interpretation=interpretation)[0]
 
     return call
 

@@ -17,11 +17,8 @@ from pliant.worker.settings import Settings, usable_cores
 
 
 @pytest.fixture
-def set_variables(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., None]:
+def set_variables(monkeypatch: pytest.MonkeyPatch, no_variables: None) -> Callable[..., None]:
     """Set variables of Pliant and no others; the working directory is empty."""
-    for name in [name for name in os.environ if name.startswith("PLIANT_")]:
-        monkeypatch.delenv(name)
-    monkeypatch.chdir(tmp_path)
 
     def assign(**variables: str) -> None:
         for name, value in variables.items():

@@ -6,7 +6,6 @@ Limits are small where a refusal is about one. Parsers run in this process; thei
 # ruff: noqa: E501
 from __future__ import annotations
 
-import io
 import json
 import pickle
 import re
@@ -33,6 +32,7 @@ from crafting import (
     hdf5,
     hdf5_virtual,
     header,
+    mat,
     mat_matrix,
     npy,
     npz,
@@ -62,12 +62,6 @@ class Case:
     options: Mapping[str, Any] = field(default_factory=dict)
     limits: Limits = Limits()  # noqa: RUF009 - frozen
     words: str
-
-
-def mat(version: str = "5", **arrays: Any) -> bytes:
-    buffer = io.BytesIO()
-    scipy.io.savemat(buffer, arrays, format=version)
-    return buffer.getvalue()
 
 
 def hdf5_sparse(file: h5py.File) -> None:
@@ -219,7 +213,7 @@ CASES: dict[str, Case] = {
         words="tracks: expected a full matrix of real numbers, such as W, got sparse W (12, 20). Save the 2F × P matrix, a sparse one after W = full(W): save('tracks.mat', 'W', '-v7')."),
     "a sparse MATLAB 7.3 matrix": Case(tracks=lambda: hdf5(hdf5_sparse),
         words="tracks: expected a full matrix of real numbers, such as W, got sparse W. Save the 2F × P matrix, a sparse one after W = full(W): save('tracks.mat', 'W', '-v7')."),
-    "a MATLAB 4 file": Case(tracks=lambda: mat(version="4", W=WALK.reshape(12, 20)),
+    "a MATLAB 4 file": Case(tracks=lambda: mat(format="4", W=WALK.reshape(12, 20)),
         words="tracks: expected npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe exports, recognised by content, got a MATLAB file of version 4. Save it in MATLAB's version 7, e.g. save('tracks.mat', 'W', '-v7')."),
     "a file of Octave": Case(tracks=lambda: b"# Created by Octave 8.4.0, Mon Jan 01 00:00:00 2024 UTC <a@b>\n# name: W\n",
         words="tracks: expected npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe exports, recognised by content, got a file in Octave's own format. Save it in MATLAB's version 7, e.g. save('tracks.mat', 'W', '-v7')."),

@@ -15,8 +15,8 @@ from typing import TypedDict
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pliant.schemas.film_limits import FilmLimits
 from pliant.tracking.decoding.containers import Container, edited_seconds, openable, recognise
-from pliant.tracking.decoding.limits import FilmLimits
 from pliant.tracking.decoding.pictures import (
     checked,
     folder_pictures,

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps, UnidentifiedImageError
+from pliant.schemas.film_limits import FilmLimits
 from pliant.schemas.pictures import SUFFIXES, pictures_in
 from pliant.tracking.decoding.containers import openable
-from pliant.tracking.decoding.limits import FilmLimits
 from pliant.tracking.errors import FilmError
 
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP")

@@ -131,23 +131,6 @@ def _at_once(write: Callable[[Result, IO[bytes]], None]) -> Callable[..., dict[s
     return written
 
 
-def _preview(result: Result, file: IO[bytes]) -> None:
-    inputs = result.inputs
-    preview.write_preview(
-        file,
-        tracks=inputs.tracks,
-        mesh=inputs.mesh,
-        solution=result.solution,
-        truth=None if inputs.ground_truth is None else inputs.ground_truth.shapes,
-        y_axis=inputs.interpretation.y_axis,
-        fps=result.options.fps,
-        uneven_times=result.uneven_times,
-        image_size=result.options.picture_size,
-        point_names=inputs.point_names,
-        texture=inputs.texture,
-    )
-
-
 KINDS = (
     Kind("shapes.npz", None, "application/zip", "All arrays: shapes (F, P, 3), deviations, cameras, faces, residuals, weights.", 1, _npz),
     Kind("shapes.glb", "glb", "model/gltf-binary", "The moving mesh and its camera as animated glTF, y up.", 4, _glb),
@@ -160,5 +143,5 @@ KINDS = (
     Kind("shapes.mdd", "mdd", "application/octet-stream", "Point cache for Blender, Maya and Houdini, y up.", 2, _plain(write_mdd)),
     Kind("metrics_frames.csv", "csv", "text/csv", "Metrics of every frame.", 2, _at_once(write_frames_csv)),
     Kind("metrics_points.csv", "csv", "text/csv", "Metrics of every point.", 1, _at_once(write_points_csv)),
-    Kind(preview.NAME, None, preview.MEDIA_TYPE, preview.DESCRIPTION, 4, _at_once(_preview)),
+    Kind(preview.NAME, None, preview.MEDIA_TYPE, preview.DESCRIPTION, 4, _at_once(preview.write_preview)),
 )  # fmt: skip

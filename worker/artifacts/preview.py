@@ -40,12 +40,13 @@ from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver import Mesh, Solution, Tracks
+from pliant.solver import Solution, Tracks
 from pliant.solver.evaluation.alignment import align
 from pliant.solver.evaluation.trust import size_of
 from pliant.solver.mesh import triangles_of
 from pliant.worker.artifacts.geometry import Floats
-from pliant.worker.formats.texture import Texture
+from pliant.worker.artifacts.result import Result
+from pliant.worker.formats import Inputs
 
 NAME = "preview.bin"
 MEDIA_TYPE = "application/octet-stream"
@@ -125,56 +126,41 @@ class Section:
         return cls(name, array.nbytes, [array.tobytes()])
 
 
-def write_preview(
-    file: IO[bytes],
-    *,
-    tracks: Tracks,
-    mesh: Mesh | None,
-    solution: Solution,
-    truth: Floats | None = None,
-    y_axis: str = "down",
-    fps: float = 25.0,
-    uneven_times: Floats | None = None,
-    image_size: tuple[int, int] | None = None,
-    point_names: Sequence[str] | None = None,
-    texture: Texture | None = None,
-) -> None:
-    """Write the file from tracks, solution and, if known, the truth `(F, P, 3)`, in any axes, NaN where unknown.
-
-    `y_axis` is the direction of the image's y axis; `fps` is the rate before frames are skipped; `uneven_times` holds the seconds of every
-    frame, `(F,)`, of a film that does not have this rate throughout; `image_size` is width and height in pixels.
-    """
+def write_preview(result: Result, file: IO[bytes]) -> None:
+    """Write the file. A truth may have any axes, and NaN where it is unknown."""
+    inputs, solution, options = result.inputs, result.solution, result.options
+    truth = None if inputs.ground_truth is None else inputs.ground_truth.shapes
     stride = max(1, -(-solution.shapes[..., 0].size // MOST_OBSERVATIONS))
     facing, mirrored = (None, False) if truth is None else _onto(solution.shapes, truth)
-    rounding = Rounding.of(tracks, solution, facing)
-    kept, faces = range(0, len(solution.shapes), stride), triangles(mesh)
+    rounding = Rounding.of(inputs.tracks, solution, facing)
+    kept, faces = range(0, len(solution.shapes), stride), triangles_of(result.faces).astype("<u4")
     header = {
         "version": VERSION,
         "num_frames": len(kept),
         "num_points": solution.shapes.shape[1],
         "num_faces": len(faces),
-        "fps": fps / stride,
+        "fps": options.fps / stride,
         "frame_stride": stride,
-        "y_axis": y_axis,
+        "y_axis": result.y_axis,
         "mirrored": mirrored,
         **rounding.header(),
         "size": size_of(solution.shapes),
         "all_frames": len(solution.shapes),
         "focal": solution.camera.focal,
         "principal_point": solution.camera.principal_point.tolist(),
-        "image_size": None if image_size is None else [float(side) for side in image_size],
+        "image_size": None if options.picture_size is None else [float(side) for side in options.picture_size],
     }
-    sections = [Section.of("faces", faces), *_sections(tracks, solution, truth, facing, kept, rounding)]
-    if uneven_times is not None:
-        sections.append(Section.of("times", uneven_times[kept].astype("<f4")))
-    _write(file, header, [*sections, *_input_sections(point_names, texture)])
+    sections = [Section.of("faces", faces), *_sections(inputs.tracks, solution, truth, facing, kept, rounding)]
+    if result.uneven_times is not None:
+        sections.append(Section.of("times", result.uneven_times[kept].astype("<f4")))
+    _write(file, header, [*sections, *_input_sections(inputs)])
 
 
-def _input_sections(point_names: Sequence[str] | None, texture: Texture | None) -> list[Section]:
+def _input_sections(inputs: Inputs) -> list[Section]:
     """Return the sections that only some inputs have: names of the points, and the picture with the points' positions in it."""
-    sections = []
-    if point_names is not None:
-        names = "\n".join(point_names).encode()
+    sections, texture = [], inputs.texture
+    if inputs.point_names is not None:
+        names = "\n".join(inputs.point_names).encode()
         sections.append(Section("names", len(names), [names]))
     if texture is not None:
         sections.append(Section.of("places", texture.uv.astype("<f4")))
@@ -225,12 +211,6 @@ def _frames_table(tracks: Tracks, solution: Solution, truth: Floats | None) -> F
         if len(lengths):
             table[frame, 5] = np.median(lengths)
     return table
-
-
-def triangles(mesh: Mesh | None) -> NDArray[np.uint32]:
-    """Return faces as triangles `(T, 3)`; quads are split, keeping their orientation."""
-    faces = np.zeros((0, 3), dtype=np.int32) if mesh is None else triangles_of(mesh.faces)
-    return faces.astype("<u4")
 
 
 def _onto(shapes: Floats, truth: Floats) -> tuple[Floats | None, bool]:

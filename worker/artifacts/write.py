@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Iterator, Sequence
@@ -11,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
+from pliant.schemas.digests import sha256
 from pliant.schemas.job import Artifact
 from pliant.schemas.options import Options
 from pliant.solver import Solution
@@ -94,8 +94,6 @@ def _report_share(on_progress: OnProgress, start: float, share: float, part: flo
 
 def described(file: Path, media_type: str, description: str) -> Artifact:
     """Return the record of a complete result file."""
-    with file.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
     return Artifact(
-        name=file.name, media_type=media_type, bytes=file.stat().st_size, sha256=digest, description=description
+        name=file.name, media_type=media_type, bytes=file.stat().st_size, sha256=sha256(file), description=description
     )

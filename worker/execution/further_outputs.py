@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from pliant.solver import Camera, Choices, Outcome, Solution, Trace
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.artifacts.result import Result, file_warnings
 from pliant.worker.artifacts.write import write_kinds, write_report
-from pliant.worker.execution.pipeline import StopCondition, silent
+from pliant.worker.execution.pipeline import StopCondition, report_export, silent
 from pliant.worker.execution.progress import Reporter
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.tracker import Tracked
@@ -64,11 +65,7 @@ def write_further(
     directory.mkdir(parents=True, exist_ok=True)
     result = Result(inputs, solution, options, job.name)
     kinds = [kind for kind in kinds_for(options, textured=result.texture is not None) if kind.output is not None]
-
-    def exported(done: float) -> None:
-        reporter.part("exporting", done)
-        halt.check()
-
+    exported = partial(report_export, reporter, halt)
     exported(0.0)
     artifacts, described = write_kinds(result, kinds, directory, on_progress=exported)
     report = {"outputs_of": job.outputs_of, "options": json.loads(options.model_dump_json()), "artifacts": described}

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from pliant.schemas.job import Artifact, Progress
@@ -99,13 +100,8 @@ def solve_and_write(
     report = build_report(inputs, solution, options, metrics=metrics, seconds=seconds, name=name)
     report["warnings"] = [*inputs.warnings, *report["warnings"], *file_warnings(options, solution)]
     report["artifacts"] = {each.name: {"bytes": each.bytes, "sha256": each.sha256} for each in earlier}
-
-    def exported(done: float) -> None:
-        reporter.part("exporting", done)
-        halt.check()
-
+    exported = partial(report_export, reporter, halt)
     artifacts = write_artifacts(inputs, solution, options, report, directory, name=name, on_progress=exported)
-    exported(1.0)
     return Finished(
         metrics=metrics,
         outcome=report["outcome"],
@@ -117,6 +113,12 @@ def solve_and_write(
         warnings=tuple(report["warnings"]),
         artifacts=tuple(artifacts),
     )
+
+
+def report_export(reporter: Reporter, halt: StopCondition, done: float) -> None:
+    """Report the completed share of the export, which stops here if the job must."""
+    reporter.part("exporting", done)
+    halt.check()
 
 
 @dataclass(slots=True)

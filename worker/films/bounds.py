@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from pliant.schemas.film_limits import FilmLimits
+
 if TYPE_CHECKING:
     from pliant.worker.settings import Settings
 
@@ -15,19 +17,9 @@ LONGEST_TRACKING = 604_800.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilmBounds:
-    """Limits on one film; `pliant.tracking.FilmLimits` enforces those on file size, frames, pixels and playing time."""
+    """Limits on one film, and on the process that reads it."""
 
-    max_bytes: int = 1 << 30
-    """Size of the film file, or of all pictures in a zip, bytes."""
-
-    max_frames: int = 3600
-    """Number of tracked frames."""
-
-    max_pixels: int = 4096 * 2304
-    """Width × height of a frame, pixels."""
-
-    max_seconds: float = 600.0
-    """Playing time up to the last tracked frame, seconds."""
+    limits: FilmLimits = FilmLimits()  # noqa: RUF009 - frozen
 
     check_seconds: float = 30.0
     """Wall time of the check at submission, seconds."""
@@ -42,10 +34,8 @@ class FilmBounds:
     """Size of one file written by that process, such as the losslessly packed grey frames of the film, bytes."""
 
     @classmethod
-    def of(cls, settings: Settings, *, max_bytes: int = 1 << 30) -> FilmBounds:
+    def of(cls, settings: Settings, *, max_bytes: int = FilmLimits().bytes) -> FilmBounds:
         """Return the bounds of an installation; the memory and time limits of jobs also apply to the film process."""
         memory = min(settings.film_memory, settings.memory_limit or settings.film_memory)
-        return cls(
-            max_bytes=max_bytes, max_frames=settings.film_frames, max_pixels=settings.film_pixels,
-            max_seconds=settings.film_seconds, track_seconds=settings.time_limit or LONGEST_TRACKING, memory=memory,
-        )  # fmt: skip
+        limits = FilmLimits(max_bytes, settings.film_frames, settings.film_pixels, settings.film_seconds)
+        return cls(limits=limits, track_seconds=settings.time_limit or LONGEST_TRACKING, memory=memory)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pliant.schemas.film_limits import FilmLimits
 from pliant.solver.errors import InvalidInput
 from pliant.worker.films import frame_strip
 from pliant.worker.films.bounds import FilmBounds
@@ -26,7 +27,7 @@ from pliant.worker.processes.contained import limit_process, serve
 from pliant.worker.processes.no_network import restrict_process
 
 if TYPE_CHECKING:
-    from pliant.tracking import Film, FilmError, FilmLimits, TrackingStep
+    from pliant.tracking import Film, FilmError, TrackingStep
 
 OPEN_FILES = 256
 """Maximum number of open descriptors: libraries, the film, the frame store."""
@@ -72,7 +73,7 @@ def _answer(request: dict[str, Any]) -> str:
         ) from error  # fmt: skip
     if request["action"] == "track" or request["estimate"]:
         import_module("pliant.tracking.track")  # before the memory limit, which is meant for the film
-    bounds = FilmBounds(**request["bounds"])
+    bounds = FilmBounds(**request["bounds"] | {"limits": FilmLimits(**request["bounds"]["limits"])})
     seconds = bounds.check_seconds if request["action"] == "check" else bounds.track_seconds * request["threads"]
     limit_process(
         {
@@ -103,9 +104,9 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
     film, planned = _opened(request, bounds), _planned(request)
     start, stop, step = film.selection
     count = len(range(film.stated_frames)[start:stop:step]) if film.stated_frames else None
-    if count is not None and count > bounds.max_frames:
+    if count is not None and count > bounds.limits.frames:
         raise FilmError(
-            "too_many_frames", field="film", expected=f"at most {bounds.max_frames} frames", got=str(count),
+            "too_many_frames", field="film", expected=f"at most {bounds.limits.frames} frames", got=str(count),
             hint="Select some with frames, for example 0:3000:2.",
         )  # fmt: skip
     with closing(film.frames()) as frames:
@@ -141,7 +142,7 @@ def _first_frame(request: dict[str, Any], bounds: FilmBounds) -> str:
     from pliant.tracking import open_film
     from pliant.tracking.contact_sheet import small_jpeg
 
-    first = next(open_film(Path(request["film"]), limits=_limits(bounds)).frames())
+    first = next(open_film(Path(request["film"]), limits=bounds.limits).frames())
     return base64.b64encode(small_jpeg(first.image, longest_side=PICTURE_SIDE, quality=PICTURE_QUALITY)).decode()
 
 
@@ -171,17 +172,11 @@ _ACTIONS: dict[str, Callable[[dict[str, Any], FilmBounds], dict[str, Any]]] = {"
 def _opened(request: dict[str, Any], bounds: FilmBounds) -> Film:
     from pliant.tracking import open_film
 
-    return open_film(Path(request["film"]), frames=request["options"]["frames"], limits=_limits(bounds))
+    return open_film(Path(request["film"]), frames=request["options"]["frames"], limits=bounds.limits)
 
 
 def _planned(request: dict[str, Any]) -> dict[str, Any]:
     return {name: request["options"][name] for name in PLANNED}
-
-
-def _limits(bounds: FilmBounds) -> FilmLimits:
-    from pliant.tracking import FilmLimits
-
-    return FilmLimits(bounds.max_bytes, bounds.max_frames, bounds.max_pixels, bounds.max_seconds)
 
 
 def _region(request: dict[str, Any]) -> Path | list[list[float]] | None:

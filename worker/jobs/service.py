@@ -61,8 +61,10 @@ class Jobs:
         """Return the jobs of this owner."""
         return replace(self, owner=owner)
 
-    def submit(self, inputs_file: Path, submission: Submission, *, interpretation: Interpretation) -> Job:
-        """Accept a job. Once this returns, the job will end with a result or an error, even if processes are killed.
+    def submit(self, inputs_file: Path, submission: Submission, *, interpretation: Interpretation) -> tuple[Job, bool]:
+        """Accept a job; return it, and whether it is new: False for that of an earlier or simultaneous equal request.
+
+        Once this returns, the job will end with a result or an error, even if processes are killed.
 
         The canonical inputs, as `worker.formats.save_inputs` writes them, are linked or copied: the caller may unlink the file,
         but must not write to it.
@@ -78,12 +80,6 @@ class Jobs:
         TooManyQueued
             The owner's limit on queued jobs is reached.
         """
-        return self.submit_once(inputs_file, submission, interpretation=interpretation)[0]
-
-    def submit_once(
-        self, inputs_file: Path, submission: Submission, *, interpretation: Interpretation
-    ) -> tuple[Job, bool]:
-        """Accept a job as `submit`; return it, and whether it is new: False for that of an earlier or simultaneous equal request."""
         known = self.known(submission)
         if known is not None:
             return known, False

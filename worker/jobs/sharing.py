@@ -5,7 +5,6 @@ Only digests of the secrets are stored, in the job's record, so they are deleted
 
 from __future__ import annotations
 
-import hashlib
 import hmac
 import secrets
 from datetime import datetime, timedelta
@@ -16,6 +15,7 @@ from pliant.worker.errors import NotAllowedNow, TooManyShares, UnknownJob, Unkno
 from pliant.worker.ids import is_id
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.records import Records, Stored, StoredShare
+from pliant.worker.tokens import digest_of
 
 MOST_SHARES = 20
 """Maximum number of valid links per job."""
@@ -38,7 +38,7 @@ def create_share(jobs: Jobs, id: str, request: ShareRequest) -> Share:
     jobs.stored(id)
     secret, now = secrets.token_urlsafe(24), jobs.clock()
     made = StoredShare(
-        id=secrets.token_hex(4), digest=_digest(secret), created_at=now,
+        id=secrets.token_hex(4), digest=digest_of(secret), created_at=now,
         expires_at=now + timedelta(seconds=request.expires_in),
     )  # fmt: skip
 
@@ -89,15 +89,11 @@ def recognise_share(records: Records, token: str) -> tuple[Stored, StoredShare] 
         stored = records.get(id)
     except UnknownJob:
         return None
-    digest = _digest(secret)
+    digest = digest_of(secret)
     for each in stored.shares:
         if hmac.compare_digest(each.digest, digest):
             return stored, each
     return None
-
-
-def _digest(secret: str) -> str:
-    return hashlib.sha256(secret.encode()).hexdigest()
 
 
 def _valid(stored: Stored, now: datetime) -> tuple[StoredShare, ...]:

@@ -12,7 +12,6 @@ ones back: the service's reconciler, which knows its limit of running jobs, queu
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -25,6 +24,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from pliant.schemas.digests import sha256
 from pliant.schemas.job import Status
 from pliant.worker.errors import BadBackup, NewerData, StaleAttempt, UnknownJob
 from pliant.worker.execution.failures import worker_lost
@@ -86,7 +86,7 @@ def write_backup(settings: Settings, target: Path) -> Summary:
     rest.write_text(json.dumps(snapshot.rest()), encoding="utf-8")
     manifest = {
         "format": FORMAT, "pliant": version("pliant"), "schema": CURRENT, "created_at": utc_now().isoformat(), "jobs": count,
-        "files": {each.name: _sha256(each) for each in (records, rest)}, "blobs": kept,
+        "files": {each.name: sha256(each) for each in (records, rest)}, "blobs": kept,
     }  # fmt: skip
     fresh = target / "manifest.json.new"
     fresh.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
@@ -209,7 +209,7 @@ def read_manifest(source: Path) -> dict[str, Any]:
 def _verified(source: Path, manifest: dict[str, Any]) -> tuple[Path, Path]:
     """Check the digests of records and results and the size of every blob; return the two files of records."""
     for name, digest in manifest["files"].items():
-        if not (source / name).is_file() or _sha256(source / name) != digest:
+        if not (source / name).is_file() or sha256(source / name) != digest:
             raise BadBackup(f"{source / name} is missing or was changed. Use another backup.")
     for key, size in manifest["blobs"].items():
         file = source / "blobs" / key
@@ -222,7 +222,7 @@ def _verified(source: Path, manifest: dict[str, Any]) -> tuple[Path, Path]:
         record = migrated(json.loads(line)["record"])  # refuses one of a newer version
         for artifact in record["job"]["artifacts"]:
             file = source / "blobs" / f"{record['prefix']}{artifact['name']}"
-            if _sha256(file) != artifact["sha256"]:
+            if sha256(file) != artifact["sha256"]:
                 raise BadBackup(f"{file} was changed: its SHA-256 does not match the record. Use another backup.")
     return records, rest
 
@@ -243,8 +243,3 @@ def _prune(target: Path, manifest: dict[str, Any]) -> None:
             path.unlink()
         elif path.is_dir() and not any(path.iterdir()):
             path.rmdir()
-
-
-def _sha256(file: Path) -> str:
-    with file.open("rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest()

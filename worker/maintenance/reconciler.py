@@ -26,7 +26,7 @@ from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import RANKS, order_waiting
 from pliant.worker.maintenance.retention import Retention, is_wanted
-from pliant.worker.records import Beat, dated
+from pliant.worker.records import Heartbeat, dated
 from pliant.worker.store.outage import Outage, warn
 
 logger = logging.getLogger(__name__)
@@ -113,7 +113,7 @@ class Reconciler:
         for id, still in self._running.look(dict(beats), gap).items():
             if still < settings.lost_after:
                 continue
-            beat: Beat = beats[id]
+            beat: Heartbeat = beats[id]
             fresh = new_attempt_id(id)
             change = partial(
                 lifecycle.requeue,
@@ -161,7 +161,7 @@ class Reconciler:
         if back:
             order_waiting(records, queue, {absent[id].owner for id in back})
 
-    def _over_the_limit(self, queued: Mapping[str, Beat], absent: Mapping[str, Beat]) -> set[str]:
+    def _over_the_limit(self, queued: Mapping[str, Heartbeat], absent: Mapping[str, Heartbeat]) -> set[str]:
         """Return the queued jobs to hold back because their owner has reached the limit of running jobs.
 
         Jobs in the queue, or on their way to a worker, count as running; the remaining capacity goes to the oldest of the

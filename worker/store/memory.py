@@ -10,7 +10,7 @@ from datetime import datetime
 
 from pliant.schemas.job import Status
 from pliant.worker.errors import QuotaExceeded, TooManyQueued, UnknownJob
-from pliant.worker.records import LOG_KEPT, Beat, Changes, Event, Records, Stored, counted, event_of, events_kept
+from pliant.worker.records import LOG_KEPT, Changes, Event, Heartbeat, Records, Stored, counted, event_of, events_kept
 from pliant.worker.store.changes import MemoryChanges
 from pliant.worker.store.queue import Queue
 
@@ -146,11 +146,11 @@ class MemoryRecords(Records):
             held = self._records.get(id)
             return held.job.status if held is not None and held.attempt_id == attempt_id else None
 
-    def beats(self, ids: Iterable[str]) -> dict[str, Beat]:
+    def beats(self, ids: Iterable[str]) -> dict[str, Heartbeat]:
         with self._lock:
             held = {id: self._records[id] for id in ids if id in self._records}
             return {
-                id: Beat(each.attempt_id, self._beats[id], each.owner, each.max_running, each.job.priority)
+                id: Heartbeat(each.attempt_id, self._beats[id], each.owner, each.max_running, each.job.priority)
                 for id, each in held.items()
             }
 

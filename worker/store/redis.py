@@ -30,9 +30,9 @@ from pliant.schemas.job import Status
 from pliant.worker.errors import QuotaExceeded, TooManyQueued, UnknownJob
 from pliant.worker.records import (
     LOG_KEPT,
-    Beat,
     Changes,
     Event,
+    Heartbeat,
     Records,
     Stored,
     counted,
@@ -270,7 +270,7 @@ class RedisRecords(Records):
             held, status = self._redis.hmget(f"{self._at}job:{id}", "token", "status")
         return Status(status) if held == attempt_id else None
 
-    def beats(self, ids: Iterable[str]) -> dict[str, Beat]:
+    def beats(self, ids: Iterable[str]) -> dict[str, Heartbeat]:
         wanted = list(ids)
         with self._checked():
             pipe = self._redis.pipeline(transaction=False)
@@ -278,7 +278,7 @@ class RedisRecords(Records):
                 pipe.hmget(f"{self._at}job:{id}", "token", "beat", "owner", "most", "priority")
             answers = pipe.execute()
         return {
-            id: Beat(attempt_id, int(beat), owner, int(most) if most else None, priority or "normal")
+            id: Heartbeat(attempt_id, int(beat), owner, int(most) if most else None, priority or "normal")
             for id, (attempt_id, beat, owner, most, priority) in zip(wanted, answers, strict=True)
             if attempt_id is not None
         }

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
+from pliant.schemas import digests
 from pliant.worker.errors import Conflict, InvalidRequest, OffsetMismatch, QuotaExceeded, UnknownUpload, UploadTooLarge
 from pliant.worker.uploads.folder import LENGTH, PART, RESERVED, WHOLE, counting, reserve, taken
 
@@ -117,7 +118,7 @@ class Writer:
         if sha256 is not None and sha256 != found:
             self._discard()
             raise InvalidRequest(
-                "digest_mismatch", field="Repr-Digest", expected=sha256, got=found,
+                "digest_mismatch", field=digests.REPR_DIGEST, expected=sha256, got=found,
                 hint="The bytes changed in transit; the upload was removed, send it again.",
             )  # fmt: skip
         self._complete(found)
@@ -147,8 +148,7 @@ class Writer:
         """Return the digest of the complete upload. After several requests the file is read once here, not in each of them."""
         if self._began == 0:
             return self._digest.hexdigest()
-        with (self.folder / PART).open("rb") as whole:
-            return hashlib.file_digest(whole, "sha256").hexdigest()
+        return digests.sha256(self.folder / PART)
 
     def _check(self, size: int) -> None:
         """Check the limits for a size in bytes, and reserve it.

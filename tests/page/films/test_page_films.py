@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import base64
-import os
 import re
 
 import cv2
 import httpx
 import numpy as np
 import pytest
-from browsing import why_not
+from browsing import NEEDS_CHROMIUM
 from filming import (
     BLUE,
     HEIGHT,
@@ -26,10 +25,7 @@ from filming import (
 from paging import drop, packed, until
 from playwright.sync_api import Page, Route, expect
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
+pytestmark = NEEDS_CHROMIUM
 
 
 @pytest.mark.parametrize("name", ["film.webm", pytest.param("pictures.zip", marks=pytest.mark.long)])

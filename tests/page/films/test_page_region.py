@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from browsing import why_not
+from browsing import AXE, NEEDS_CHROMIUM
 from filming import (
     HEIGHT,
     WIDTH,
@@ -22,12 +21,7 @@ from filming import (
 from paging import BOTH_WIDTHS_AND_THEMES, drop, until
 from playwright.sync_api import Browser, Page, Route, expect
 
-pytestmark = [
-    pytest.mark.chromium,
-    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
-]
-
-AXE = Path(__file__).parents[3] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
+pytestmark = NEEDS_CHROMIUM
 
 
 def test_a_region_drawn_with_the_mouse_is_sent_with_the_film(

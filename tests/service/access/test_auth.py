@@ -26,11 +26,6 @@ from pliant.worker.tokens import Scope, Tokens
 from serving import Running, Serve, finish, form, settings_from, submit, tracks, until
 
 
-@pytest.fixture(scope="module")
-def guarded(serve: Serve) -> Running:
-    return serve(auth="required")
-
-
 @pytest.fixture
 def ada(guarded: Running) -> Iterator[httpx.Client]:
     with guarded.client() as client:

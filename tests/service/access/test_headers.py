@@ -20,11 +20,6 @@ CAREFUL = {
 
 
 @pytest.fixture(scope="module")
-def guarded(serve: Serve) -> Running:
-    return serve(auth="required")
-
-
-@pytest.fixture(scope="module")
 def user(guarded: Running) -> Iterator[httpx.Client]:
     with guarded.client() as client:
         yield client

@@ -42,7 +42,7 @@ from crafting import (
     hdf5_virtual,
     header,
     many_members,
-    mat5,
+    mat,
     mat_many_bombs,
     mat_matrix,
     mat_nested,
@@ -166,7 +166,7 @@ MAT5 = (
     Attack("MAT no dimensions", "no axes at all", lambda: mat_matrix(()), ("damaged_file", "wrong_shape", "missing_array")),
     Attack("MAT nested cells", "3,000 cells, each in the next", lambda: mat_nested(3000), ("damaged_file", "missing_array", "too_large")),
     Attack("MAT unknown class", "a class that there is not", lambda: mat_matrix((2, 4), flags=99), ("damaged_file", "missing_array")),
-    Attack("MAT cut off", "half a file", lambda: mat5({"W": np.ones((12, 20))})[:300], ("damaged_file", "missing_array")),
+    Attack("MAT cut off", "half a file", lambda: mat(W=np.ones((12, 20)))[:300], ("damaged_file", "missing_array")),
     Attack("MAT noise", "a header and noise", lambda: MAT_HEADER + np.random.default_rng(1).bytes(4000),
            ("damaged_file", "too_large", "missing_array")),
 )  # fmt: skip

@@ -173,9 +173,9 @@ def hdf5_bomb(file: h5py.File) -> None:
     file.create_dataset("W", (2000, 50_000), dtype="f8", chunks=(2000, 1000), compression="gzip")  # none of it written
 
 
-def mat5(variables: dict[str, object], *, packed: bool = False) -> bytes:
+def mat(*, packed: bool = False, format: str = "5", **variables: object) -> bytes:
     buffer = io.BytesIO()
-    scipy.io.savemat(buffer, variables, do_compression=packed)
+    scipy.io.savemat(buffer, variables, do_compression=packed, format=format)
     return buffer.getvalue()
 
 
@@ -221,7 +221,7 @@ def ply(head: str, body: bytes = b"", *, kind: str = "binary_little_endian") -> 
 
 
 def mat_many_bombs() -> bytes:
-    whole = mat5({"W": np.zeros((980, 980))}, packed=True)
+    whole = mat(W=np.zeros((980, 980)), packed=True)
     return whole[:128] + 10 * whole[128:]
 
 

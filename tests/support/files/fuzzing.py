@@ -27,7 +27,7 @@ from hypothesis import strategies as st
 sys.path.insert(0, str(Path(__file__).parent))
 
 from attack_files import HDF5, HEADERS, MAT5, MESHES, TEXT, ZIPS
-from crafting import BINARY, GFACES, HONEST, OBJ_POINTS, archive, glb, gltf, mat5, ply, png
+from crafting import BINARY, GFACES, HONEST, OBJ_POINTS, archive, glb, gltf, mat, ply, png
 from pliant.solver import InvalidInput
 from pliant.worker.formats.reading.arrays import read_npy, read_npz
 from pliant.worker.formats.reading.parsers import PARSERS, parse
@@ -80,7 +80,7 @@ def honest(parser: str) -> list[bytes]:
         "npy": [HONEST],
         "npz": [archive(("tracks.npy", HONEST), ("visibility.npy", HONEST))],
         "matlab5": [
-            mat5({"W": np.ones((12, 20)), "s": {"a": np.ones((3, 4)), "c": np.zeros((1, 2), object)}}, packed=packed)
+            mat(W=np.ones((12, 20)), s={"a": np.ones((3, 4)), "c": np.zeros((1, 2), object)}, packed=packed)
             for packed in (False, True)
         ],
         "matlab73": [matlab73],

@@ -11,10 +11,12 @@ from pathlib import Path
 from types import TracebackType
 
 import numpy as np
+import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
 
 ROOT = Path(__file__).parents[3]
+AXE = ROOT / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 
 
@@ -32,6 +34,12 @@ def why_not() -> str | None:
         return "the page is not built; say `make page`"
     return None
 
+
+NEEDS_CHROMIUM = [
+    pytest.mark.chromium,
+    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
+]
+"""Marks of the tests that open the page."""
 
 expect.set_options(timeout=20_000)  # milliseconds; a busy machine may need more than the usual five seconds
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 from playwright.sync_api import Locator, Page
@@ -69,6 +70,11 @@ DROP = """([files]) => {
 
 def drop(page: Page, files: dict[str, bytes]) -> None:
     page.evaluate(DROP, [[[name, base64.b64encode(content).decode()] for name, content in files.items()]])
+
+
+def record(url: str, of: str, **changes: Any) -> dict[str, Any]:
+    """Return the record of a job, with changes."""
+    return {**httpx.get(f"{url}/v1/jobs/{of}").json(), **changes}
 
 
 def until(holds: Callable[[], bool], seconds: float = 30) -> None:

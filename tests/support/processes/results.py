@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,8 @@ from pliant.schemas.options import Options
 from pliant.solver import Camera, Choices, Mesh, Outcome, Solution, Trace, Tracks
 from pliant.solver.evaluation.trust import assess
 from pliant.worker.artifacts import build_report, write_artifacts
+from pliant.worker.artifacts.preview import write_preview
+from pliant.worker.artifacts.result import Result
 from pliant.worker.formats import GroundTruth, Inputs, Texture
 from scipy.spatial.transform import Rotation
 
@@ -99,6 +103,35 @@ def write(directory: Path, made: tuple[Inputs, Solution, Options]) -> dict[str, 
         assert artifact.description
     assert {path.name for path in directory.iterdir()} == {artifact.name for artifact in written}
     return {artifact.name: directory / artifact.name for artifact in written}
+
+
+def preview_of(
+    tracks: Tracks,
+    solution: Solution,
+    *,
+    mesh: Mesh | None = None,
+    truth: np.ndarray | None = None,
+    texture: Texture | None = None,
+    frame_times: np.ndarray | None = None,
+    y_axis: str = "down",
+    **options: Any,
+) -> bytes:
+    """Return `preview.bin` of a result."""
+    frames, points = tracks.points.shape[:2]
+    interpretation = Interpretation(
+        num_frames=frames, num_points=points, num_faces=0, hidden_fraction=0.0, mesh_source="none", has_ground_truth=truth is not None,
+        has_rotations=False, layout="tracks (F, P, 2)", y_axis=y_axis,
+    )  # fmt: skip
+    known = None if truth is None else GroundTruth(truth)
+    inputs = Inputs(tracks, mesh, known, None, interpretation, texture=texture, frame_times=frame_times)
+    into = io.BytesIO()
+    write_preview(Result(inputs, solution, Options(**options)), into)
+    return into.getvalue()
+
+
+def disk_full(*_: object, **__: object) -> None:
+    """Fail in place of a function that writes."""
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def make_texture(rows: int, columns: int) -> Texture:

@@ -96,7 +96,7 @@ class House:
         )  # fmt: skip
         options = Options.model_validate(LONG) if long else SHORT
         submission = Submission(options=options, **more)  # type: ignore[arg-type]
-        return self.jobs.submit(file, submission, interpretation=interpretation).id
+        return self.jobs.submit(file, submission, interpretation=interpretation)[0].id
 
     def until(self, condition: Callable[[], object], what: str, *, seconds: float = 20.0) -> float:
         """Poll while the supervisor keeps the children running; return the seconds it took."""

@@ -26,7 +26,7 @@ from pliant.worker.artifacts.geometry import upright, vertex_normals, viewer_sca
 from pliant.worker.artifacts.scenes import usd
 from pliant.worker.execution import pipeline
 from pliant.worker.formats.records import Selection
-from results import make_result
+from results import disk_full, make_result
 
 ALWAYS = {"shapes.npz", "preview.bin", "report.json"}
 
@@ -350,10 +350,7 @@ def test_mat_files_above_2_gib_are_rejected_before_computing(tmp_path: Path, mon
 
 
 def test_a_failed_usd_write_leaves_no_partial_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(usd.shutil, "copyfileobj", full)
+    monkeypatch.setattr(usd.shutil, "copyfileobj", disk_full)
     with pytest.raises(OSError, match="No space"):
         write(tmp_path, make_result(outputs="usd"))
     assert {path.name for path in tmp_path.iterdir()} == {"shapes.npz"}

@@ -6,7 +6,6 @@ import io
 import json
 import struct
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,10 @@ from PIL import Image
 from pliant.solver import Camera, Mesh, Solution, Tracks
 from pliant.solver.evaluation.alignment import align
 from pliant.solver.gallery import Sequence, corrupt, face
+from pliant.solver.mesh import triangles_of
 from pliant.worker.artifacts import preview
 from pliant.worker.formats.texture import Texture
+from results import preview_of
 
 F, P = 6, 60
 
@@ -41,13 +42,7 @@ def solution_of(sequence: Sequence, *, mirrored: bool = False) -> Solution:
     return Solution(shapes=shapes, camera=camera, weights=seen.astype(float), **rest)
 
 
-def write(path: Path, **given: Any) -> None:
-    with path.open("wb") as file:
-        preview.write_preview(file, **given)
-
-
-def read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    raw = path.read_bytes()
+def read(raw: bytes) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     assert raw[:8] == b"PLIANTPV"
     version, length = struct.unpack_from("<II", raw, 8)
     assert version == 1
@@ -80,11 +75,10 @@ def world(header: dict[str, Any], values: NDArray[Any]) -> NDArray[np.float64]:
     return np.array(header["origin"]) + header["step"] * values
 
 
-def test_positions_round_trip_within_half_a_quantization_step(sequence: Sequence, tmp_path: Path) -> None:
+def test_positions_round_trip_within_half_a_quantization_step(sequence: Sequence) -> None:
     solution = solution_of(sequence)
-    path = tmp_path / preview.NAME
-    write(path, tracks=sequence.tracks, mesh=sequence.mesh, solution=solution, y_axis="up", fps=12)
-    header, arrays = read(path)
+    raw = preview_of(sequence.tracks, solution, mesh=sequence.mesh, y_axis="up", fps=12)
+    header, arrays = read(raw)
     error = np.abs(world(header, arrays["positions"]) - solution.shapes).max()
     assert 0 < error <= 0.5001 * header["step"]
     assert header["step"] < np.ptp(solution.shapes) / 60_000
@@ -94,11 +88,10 @@ def test_positions_round_trip_within_half_a_quantization_step(sequence: Sequence
     assert "truth" not in arrays
 
 
-def test_projections_plus_residuals_give_the_tracks(sequence: Sequence, tmp_path: Path) -> None:
+def test_projections_plus_residuals_give_the_tracks(sequence: Sequence) -> None:
     solution = solution_of(sequence)
-    path = tmp_path / preview.NAME
-    write(path, tracks=sequence.tracks, mesh=None, solution=solution)
-    header, arrays = read(path)
+    raw = preview_of(sequence.tracks, solution)
+    header, arrays = read(raw)
     hidden = sequence.tracks.visible == 0
     assert (arrays["residuals"][hidden] == -32768).all()
     assert (arrays["residuals"][~hidden] > -32768).all()
@@ -110,9 +103,7 @@ def test_projections_plus_residuals_give_the_tracks(sequence: Sequence, tmp_path
 
 
 @pytest.mark.parametrize(("mirrored", "unit"), [(False, 1.0), (True, 1000.0)])
-def test_truth_is_aligned_and_scaled_to_the_result(
-    sequence: Sequence, tmp_path: Path, mirrored: bool, unit: float
-) -> None:
+def test_truth_is_aligned_and_scaled_to_the_result(sequence: Sequence, mirrored: bool, unit: float) -> None:
     turned = sequence.shapes @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0] + 5.0
     if (
         np.linalg.det(
@@ -125,9 +116,8 @@ def test_truth_is_aligned_and_scaled_to_the_result(
     truth[:, 7] = np.nan
     truth *= unit
     solution = solution_of(sequence, mirrored=mirrored)
-    path = tmp_path / preview.NAME
-    write(path, tracks=sequence.tracks, mesh=sequence.mesh, solution=solution, truth=truth)
-    header, arrays = read(path)
+    raw = preview_of(sequence.tracks, solution, mesh=sequence.mesh, truth=truth)
+    header, arrays = read(raw)
     assert header["mirrored"] is mirrored
     known = np.arange(P) != 7
     apart = np.linalg.norm(world(header, arrays["truth"]) - world(header, arrays["positions"]), axis=2)
@@ -136,24 +126,22 @@ def test_truth_is_aligned_and_scaled_to_the_result(
     assert (apart[:, 7] == 0).all()
 
 
-def test_a_result_without_extent_shows_no_truth(sequence: Sequence, tmp_path: Path) -> None:
+def test_a_result_without_extent_shows_no_truth(sequence: Sequence) -> None:
     solution = replace(solution_of(sequence), shapes=np.zeros_like(sequence.shapes))
-    path = tmp_path / preview.NAME
-    write(path, tracks=sequence.tracks, mesh=None, solution=solution, truth=sequence.shapes)
-    _, arrays = read(path)
+    raw = preview_of(sequence.tracks, solution, truth=sequence.shapes)
+    _, arrays = read(raw)
     assert "truth" not in arrays
 
 
-def test_tables_hold_visibility_rejections_and_uncertainty(sequence: Sequence, tmp_path: Path) -> None:
+def test_tables_hold_visibility_rejections_and_uncertainty(sequence: Sequence) -> None:
     exact = solution_of(sequence)
     seen = sequence.tracks.visible > 0
     weights = seen.astype(float)
     weights[2, np.flatnonzero(seen[2])[:5]] = 0
     std = np.random.default_rng(4).uniform(0.1, 2.0, size=(F, P))
     solution = replace(exact, weights=weights, shapes_std=std)
-    path = tmp_path / preview.NAME
-    write(path, tracks=sequence.tracks, mesh=None, solution=solution, truth=sequence.shapes, image_size=(320, 240))
-    header, arrays = read(path)
+    raw = preview_of(sequence.tracks, solution, truth=sequence.shapes, image_size="320x240")
+    header, arrays = read(raw)
     assert (header["all_frames"], header["image_size"]) == (F, [320, 240])
     np.testing.assert_array_equal(arrays["points"][:, 0], seen.sum(axis=0))
     rejected = np.unpackbits(arrays["rejected"], axis=1, count=P, bitorder="little").astype(bool)
@@ -168,63 +156,58 @@ def test_tables_hold_visibility_rejections_and_uncertainty(sequence: Sequence, t
     assert table[:, 4].max() < 1e-6
 
 
-def test_columns_are_nan_without_posterior_and_truth(sequence: Sequence, tmp_path: Path) -> None:
-    path = tmp_path / preview.NAME
-    write(path, tracks=sequence.tracks, mesh=None, solution=solution_of(sequence))
-    header, arrays = read(path)
+def test_columns_are_nan_without_posterior_and_truth(sequence: Sequence) -> None:
+    raw = preview_of(sequence.tracks, solution_of(sequence))
+    header, arrays = read(raw)
     assert "spread" not in header["sections"]
     assert np.isnan(arrays["frames"][:, 3:5]).all()
     assert np.isfinite(arrays["frames"][:, 5]).all()
 
 
-def test_truth_of_too_few_points_is_omitted(sequence: Sequence, tmp_path: Path) -> None:
+def test_truth_of_too_few_points_is_omitted(sequence: Sequence) -> None:
     truth = np.full((F, P, 3), np.nan)
     truth[:, :2] = 1.0
-    path = tmp_path / preview.NAME
-    write(path, tracks=sequence.tracks, mesh=None, solution=solution_of(sequence), truth=truth)
-    assert "truth" not in read(path)[0]["sections"]
+    raw = preview_of(sequence.tracks, solution_of(sequence), truth=truth)
+    assert "truth" not in read(raw)[0]["sections"]
 
 
 def test_a_long_sequence_is_subsampled_evenly_and_keeps_its_speed(
-    sequence: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(preview, "MOST_OBSERVATIONS", F * P // 2)
-    path = tmp_path / preview.NAME
     solution = solution_of(sequence)
-    write(path, tracks=sequence.tracks, mesh=None, solution=solution, fps=30, uneven_times=np.arange(F) ** 2.0)
-    header, arrays = read(path)
+    raw = preview_of(sequence.tracks, solution, fps=30, frame_times=np.arange(F) ** 2 / 150)
+    header, arrays = read(raw)
     assert (header["num_frames"], header["frame_stride"], header["fps"]) == (3, 2, 15)
     np.testing.assert_allclose(world(header, arrays["positions"]), solution.shapes[::2], atol=header["step"])
-    np.testing.assert_array_equal(arrays["times"], [0, 4, 16])
+    np.testing.assert_allclose(arrays["times"], np.array([0, 4, 16]) / 150, rtol=1e-6)
 
 
 def test_quads_become_triangles_of_the_same_orientation() -> None:
     mesh = Mesh.from_grid(np.arange(6).reshape(2, 3))
-    found = preview.triangles(mesh)
+    found = triangles_of(mesh.faces)
     assert found.shape == (4, 3)
     plane = np.array([(x, y, 0.0) for y in range(2) for x in range(3)])
     normals = np.cross(plane[found[:, 1]] - plane[found[:, 0]], plane[found[:, 2]] - plane[found[:, 0]])
     assert len({float(z) for z in normals[:, 2]}) == 1
 
 
-def test_a_perfect_fit_has_a_positive_residual_step(tmp_path: Path) -> None:
+def test_a_perfect_fit_has_a_positive_residual_step() -> None:
     sequence = face(3, 12)
     exact = solution_of(sequence)
     projected = exact.camera.scales[:, None, None] * exact.shapes @ exact.camera.rotations[:, :2].transpose(0, 2, 1)
     tracks = Tracks.from_arrays(projected + exact.camera.translations[:, None])
-    path = tmp_path / preview.NAME
-    write(path, tracks=tracks, mesh=None, solution=exact)
-    header, arrays = read(path)
+    raw = preview_of(tracks, exact)
+    header, arrays = read(raw)
     assert header["residual_step"] > 0
     assert np.abs(header["residual_step"] * arrays["residuals"]).max() < 1e-9
 
 
-def test_a_films_picture_and_texture_coordinates_round_trip(sequence: Sequence, tmp_path: Path) -> None:
+def test_a_films_picture_and_texture_coordinates_round_trip(sequence: Sequence) -> None:
     places = np.random.default_rng(0).random((P, 2))
     texture = Texture.from_tracked(np.full((8, 10, 3), (200, 90, 30), dtype=np.uint8), places)
-    path = tmp_path / preview.NAME
-    write(path, tracks=sequence.tracks, mesh=sequence.mesh, solution=solution_of(sequence), texture=texture)
-    _, arrays = read(path)
+    raw = preview_of(sequence.tracks, solution_of(sequence), mesh=sequence.mesh, texture=texture)
+    _, arrays = read(raw)
     np.testing.assert_array_equal(arrays["places"], places.astype("<f4"))
     with Image.open(io.BytesIO(arrays["picture"].tobytes())) as picture:
         assert (picture.format, picture.size) == ("JPEG", (10, 8))

@@ -22,7 +22,7 @@ from pliant.worker.artifacts.colours import linear, shade
 from pliant.worker.artifacts.geometry import upright, vertex_normals, viewer_scale
 from pliant.worker.artifacts.glb import write_glb
 from pxr import Gf, Usd, UsdGeom
-from results import make_result, moving_sheet, write
+from results import disk_full, make_result, moving_sheet, write
 
 DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
@@ -309,10 +309,7 @@ def test_a_failed_write_keeps_the_old_file_and_no_partial_file(tmp_path: Path, m
     files = write(tmp_path, make_result())
     before = files["shapes.npz"].read_bytes()
 
-    def full(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(np, "savez", full)
+    monkeypatch.setattr(np, "savez", disk_full)
     inputs, solution, options = make_result(8)
     with pytest.raises(OSError, match="No space"):
         write_artifacts(inputs, solution, options, {}, tmp_path)

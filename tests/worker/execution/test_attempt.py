@@ -41,7 +41,7 @@ def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 @pytest.fixture
 def attempt(jobs: Jobs, now: list[float], inputs_file: Path, interpretation: Interpretation) -> Attempt:
-    id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+    id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)[0].id
     attempt_id = jobs.records.get(id).attempt_id
     jobs.records.update(
         id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker="w", now=datetime.now(UTC))
@@ -228,7 +228,7 @@ def test_progress_is_repeated_while_files_are_fetched_and_stored(
 ) -> None:
     read = make_inputs(tmp_path / "in.npz", frames=4, points=30).interpretation
     options = Options(method="pseudo_inverse", outputs=(), refine_rotations=False)
-    id = jobs.submit(tmp_path / "in.npz", Submission(options=options), interpretation=read).id
+    id = jobs.submit(tmp_path / "in.npz", Submission(options=options), interpretation=read)[0].id
     stored = jobs.records.get(id)
     told: list[Progress] = []
     during: dict[str, list[Progress]] = {}
@@ -262,7 +262,7 @@ def test_a_job_runs_even_if_the_reply_to_its_claim_is_lost(
 ) -> None:
     file = tmp_path / "inputs.npz"
     make_inputs(file, frames=4, points=20)
-    id = jobs.submit(file, Submission(options=SHORT), interpretation=interpretation).id
+    id = jobs.submit(file, Submission(options=SHORT), interpretation=interpretation)[0].id
     attempt_id = jobs.records.get(id).attempt_id
     replace, lost = jobs.records.replace, []
 
@@ -285,7 +285,7 @@ def test_a_scratch_folder_that_cannot_be_made_fails_the_job_with_its_cause(
     jobs: Jobs, inputs_file: Path, interpretation: Interpretation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Jobs, "open", lambda _: jobs)
-    id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+    id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)[0].id
     work_folder = jobs.settings.data / "work"
     if work_folder.exists():
         work_folder.rmdir()
@@ -309,7 +309,7 @@ def test_a_worker_with_another_blob_store_names_the_setting(
     caplog.set_level("INFO")
     elsewhere = dataclasses.replace(jobs, blobs=Blobs.open((tmp_path / "elsewhere").as_uri()))
     monkeypatch.setattr(Jobs, "open", lambda _: elsewhere)
-    id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+    id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)[0].id
     run(id, jobs.records.get(id).attempt_id, settings=jobs.settings, worker="w")
     job = jobs.get(id)
     assert job.error is not None
@@ -342,7 +342,7 @@ def test_a_full_disk_is_named_and_freed_before_the_failure_is_recorded(
     monkeypatch.setattr(jobs.records, "update", update)
     monkeypatch.setattr("pliant.worker.execution.pipeline.reconstruct", fill)
     make_inputs(tmp_path / "inputs.npz", frames=6, points=40)
-    id = jobs.submit(tmp_path / "inputs.npz", Submission(options=Options()), interpretation=interpretation).id
+    id = jobs.submit(tmp_path / "inputs.npz", Submission(options=Options()), interpretation=interpretation)[0].id
     run(id, jobs.records.get(id).attempt_id, settings=jobs.settings, worker="w")
     job = jobs.get(id)
     assert job.error is not None

@@ -39,7 +39,7 @@ def running(jobs: Jobs, inputs_file: Path, interpretation: Interpretation) -> Ca
     """A claimed job under supervision, with settings and a clock set by the test."""
 
     def make(time: list[float] | None = None, options: Options | None = None, **settings: object) -> Watch:
-        id = jobs.submit(inputs_file, Submission(options=options or Options()), interpretation=interpretation).id
+        id = jobs.submit(inputs_file, Submission(options=options or Options()), interpretation=interpretation)[0].id
         attempt_id = jobs.records.get(id).attempt_id
         jobs.records.update(id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker="me", now=NOW))
         clock = time if time is not None else [0.0]

@@ -72,7 +72,7 @@ def test_scratch_files_are_removed_once_the_store_confirms_their_owner(
         queue=jobs.queue,
         name="me",
     )
-    id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+    id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)[0].id
     attempt_id = jobs.records.get(id).attempt_id
     jobs.records.update(id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker="me", now=utc_now()))
     folder = working_directory(jobs.settings, attempt_id)

@@ -8,10 +8,12 @@ from pathlib import Path
 import pytest
 from attack_files import ATTACKS, OVER_HTTP, Attack
 from crafting import CANARY, HONEST
+from pliant.schemas.film_limits import FilmLimits
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
+from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.sources import FilmSource
-from pliant.worker.films.tracker import FilmBounds, read_film
+from pliant.worker.films.tracker import read_film
 from pliant.worker.formats import store_inputs
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("forked_readers")]
@@ -26,7 +28,9 @@ def test_a_crafted_file_is_refused_by_its_reader(attack: Attack, tmp_path: Path)
     given: dict[str, Path | str] = {"tracks": honest, **attack.texts, attack.part: crafted}
     given.pop("options", None)
     read = (
-        partial(read_film, FilmSource(crafted, None), options, FilmBounds(max_bytes=attack.limits.max_bytes))
+        partial(
+            read_film, FilmSource(crafted, None), options, FilmBounds(limits=FilmLimits(bytes=attack.limits.max_bytes))
+        )
         if attack.part == "film"
         else partial(store_inputs, **given, options=options, limits=attack.limits, target=tmp_path / "inputs.npz")  # type: ignore[arg-type]
     )

@@ -223,7 +223,7 @@ def test_a_worker_puts_back_a_job_that_is_too_large_for_it(settings: Settings, i
         alive(house.jobs, "large", 1 << 60)
         big = interpretation(100, 1_000_000)
         submission = Submission(options=Options(max_reweightings=2))
-        id = house.jobs.submit(house.short_inputs, submission, interpretation=big).id
+        id = house.jobs.submit(house.short_inputs, submission, interpretation=big)[0].id
         other = house.submit()
         assert house.final(other).status is Status.SUCCEEDED
         assert house.jobs.get(id).status is Status.QUEUED

@@ -63,7 +63,7 @@ def solved(jobs: Jobs, kept: tuple[Path, Finished], tmp_path: Path) -> Job:
 
     shutil.copy(folder / "in.npz", tmp_path / "in.npz")
     read = load_inputs(folder / "in.npz").interpretation
-    job = jobs.submit(tmp_path / "in.npz", Submission(options=OPTIONS, name="face"), interpretation=read)
+    job = jobs.submit(tmp_path / "in.npz", Submission(options=OPTIONS, name="face"), interpretation=read)[0]
     done = run(jobs, job, tmp_path / "solving", reconstruct=copy)
     assert done.status is Status.SUCCEEDED, done.error
     return done
@@ -84,7 +84,7 @@ def test_further_outputs_follow_the_uneven_times_of_a_film(jobs: Jobs, tmp_path:
     inputs = make_inputs(tmp_path / "even.npz", frames=4, points=30)
     save_inputs(dataclasses.replace(inputs, frame_times=times), tmp_path / "in.npz")
     options = OPTIONS.model_copy(update={"fps": 2.0})  # the mean rate: 3 frames in 1.5 s
-    solved = jobs.submit(tmp_path / "in.npz", Submission(options=options), interpretation=inputs.interpretation)
+    solved = jobs.submit(tmp_path / "in.npz", Submission(options=options), interpretation=inputs.interpretation)[0]
     assert run(jobs, solved, tmp_path / "solving").status is Status.SUCCEEDED
     more, _ = make_outputs(jobs, solved.id, OutputRequest(outputs=("mdd",)))
     assert run(jobs, more, tmp_path / "w").status is Status.SUCCEEDED
@@ -104,7 +104,7 @@ def test_further_outputs_of_a_new_job_of_the_same_id_are_its_own(jobs: Jobs, tmp
     made = []
     for frames in (4, 5):
         read = make_inputs(tmp_path / f"{frames}.npz", frames=frames, points=30).interpretation
-        job = jobs.submit(tmp_path / f"{frames}.npz", Submission(options=OPTIONS, id="take-1"), interpretation=read)
+        job = jobs.submit(tmp_path / f"{frames}.npz", Submission(options=OPTIONS, id="take-1"), interpretation=read)[0]
         assert run(jobs, job, tmp_path / f"solving {frames}").status is Status.SUCCEEDED
         more, new = make_outputs(jobs, "take-1", WANTED)
         assert new

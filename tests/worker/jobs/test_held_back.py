@@ -23,7 +23,7 @@ def test_the_running_limit_holds_and_the_next_job_starts_when_one_ends(
     def made(owner: str) -> str:
         jobs = world.jobs.of(owner)
         world.now += timedelta(milliseconds=10)
-        return jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+        return jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)[0].id
 
     def waiting() -> list[str]:
         return [attempt_id.rpartition("-")[0] for attempt_id in world.jobs.queue.waiting()]
@@ -67,7 +67,7 @@ def test_a_job_released_between_two_checks_is_not_considered_lost(
 
     def made() -> str:
         world.now += timedelta(milliseconds=10)
-        return world.jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+        return world.jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)[0].id
 
     running = made()
     attempt_id = world.claim(running)
@@ -88,7 +88,9 @@ def test_a_new_reconciler_knows_the_held_back_jobs(
 ) -> None:
     world = World(tmp_path, max_running=1)
     first, second = (
-        world.jobs.submit(inputs_file, Submission(options=Options(), id=f"job-{n}"), interpretation=interpretation).id
+        world.jobs.submit(inputs_file, Submission(options=Options(), id=f"job-{n}"), interpretation=interpretation)[
+            0
+        ].id
         for n in "12"
     )
     world.jobs.queue.release(world.jobs.records.get(second).attempt_id)  # as if there had been no time to note it
@@ -108,7 +110,9 @@ def test_a_job_on_its_way_to_a_worker_counts_as_running(
 ) -> None:
     world = World(tmp_path, max_running=1)
     first, second = (
-        world.jobs.submit(inputs_file, Submission(options=Options(), id=f"job-{n}"), interpretation=interpretation).id
+        world.jobs.submit(inputs_file, Submission(options=Options(), id=f"job-{n}"), interpretation=interpretation)[
+            0
+        ].id
         for n in "12"
     )
     world.pass_seconds(1)
@@ -129,7 +133,7 @@ def test_a_tokens_running_limit_overrides_the_default(
     def made(owner: str, most: int | None) -> str:
         jobs = dataclasses.replace(world.jobs.of(owner), max_running=most)
         world.now += timedelta(milliseconds=10)
-        return jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+        return jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)[0].id
 
     ones, threes, usual, free = ([made(f"{most}", most) for _ in range(4)] for most in (1, 3, None, 0))
     expected = [*ones[:1], *threes[:3], *usual[:2], *free]
@@ -145,7 +149,7 @@ def test_the_place_in_queue_is_zero_once_a_worker_has_taken_the_job_and_null_whi
     world = World(tmp_path, max_running=1)
     jobs = world.jobs.of("ada")
     first, second = (
-        jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation) for _ in range(2)
+        jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)[0] for _ in range(2)
     )
     assert (first.place_in_queue, second.place_in_queue) == (0, None)
     world.jobs.queue.remove(world.jobs.queue.waiting()[0])

@@ -23,7 +23,7 @@ NOW = datetime(2030, 1, 1, tzinfo=UTC)
 @pytest.fixture
 def submit(jobs: Jobs, inputs_file: Path, interpretation: Interpretation) -> Callable[[], Stored]:
     def make() -> Stored:
-        id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+        id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)[0].id
         return jobs.records.get(id)
 
     return make

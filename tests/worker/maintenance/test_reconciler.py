@@ -34,7 +34,9 @@ def world(tmp_path: Path) -> World:
 
 @pytest.fixture
 def submit(inputs_file: Path, interpretation: Interpretation) -> Callable[[World], str]:
-    return lambda world: world.jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+    return lambda world: (
+        world.jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)[0].id
+    )
 
 
 def test_a_job_without_heartbeats_is_requeued_then_fails(world: World, submit: Callable[[World], str]) -> None:
@@ -351,7 +353,7 @@ def test_a_clock_jump_of_a_year_loses_nothing(
     world: World, jump: timedelta, inputs_file: Path, interpretation: Interpretation
 ) -> None:
     def submit() -> str:
-        return world.jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+        return world.jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)[0].id
 
     done, busy, waiting = submit(), submit(), submit()
     world.claim(done)

@@ -7,8 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -21,19 +19,13 @@ from pliant.worker.processes.supervisor import FIRST_PAUSE, Child, Supervisor, w
 from pliant.worker.processes.valkey import Valkey, find_binary
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect, reachable
+from serving import until
 
 from benchmarks.installation.instance import running
 
 
 def python(name: str, code: str, **more: object) -> Child:
     return Child(name=name, argv=[sys.executable, "-S", "-c", code], **more)  # type: ignore[arg-type]
-
-
-def until(condition: Callable[[], object], seconds: float = 15.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 SLEEP = "import time; time.sleep(600)"
@@ -43,7 +35,7 @@ def test_the_log_of_a_child_that_ended_is_quoted(caplog: pytest.LogCaptureFixtur
     ended = python("short", "raise SystemExit(3)", log_tail=lambda: "Short write", cause=lambda: "The disk is full.")
     supervisor = Supervisor([ended])
     supervisor.start()
-    until(lambda: supervisor.look() or caplog.records)
+    until(lambda: supervisor.look() or caplog.records, seconds=15)
     words = "short ended with code 3. Its log ends with: Short write. The disk is full. Starting it again in"
     assert words in caplog.records[-1].getMessage()
     supervisor.stop()
@@ -60,7 +52,7 @@ def test_ended_children_are_restarted_with_growing_pauses(tmp_path: Path) -> Non
         supervisor.look()
         return [float(line) for line in log.read_text().split()] if log.exists() else []
 
-    until(lambda: len(starts()) >= 4)
+    until(lambda: len(starts()) >= 4, seconds=15)
     first, second, third, fourth = starts()[:4]
     # Each pause is twice the one before; starting the process takes extra time, more on a busy machine.
     for number, gap in enumerate((second - first, third - second, fourth - third), start=1):
@@ -83,11 +75,11 @@ def test_a_child_that_cannot_be_started_again_is_tried_later_and_leaves_the_othe
         raise BlockingIOError("Resource temporarily unavailable")
 
     monkeypatch.setattr(subprocess, "Popen", no_process)
-    until(lambda: supervisor.look() or "cannot be started" in caplog.text)
+    until(lambda: supervisor.look() or "cannot be started" in caplog.text, seconds=15)
     assert "short cannot be started: Resource temporarily unavailable. Trying again in 0.8 s" in caplog.text
     assert running(steady)
     monkeypatch.setattr(subprocess, "Popen", start)
-    until(lambda: supervisor.look() or "short" in supervisor.pids())
+    until(lambda: supervisor.look() or "short" in supervisor.pids(), seconds=15)
     supervisor.stop()
 
 
@@ -125,7 +117,7 @@ def test_children_stop_before_foundations_and_are_killed_after_their_grace(tmp_p
     ]
     supervisor = Supervisor(children)
     supervisor.start()
-    until(lambda: all((tmp_path / child.name).exists() for child in children))
+    until(lambda: all((tmp_path / child.name).exists() for child in children), seconds=15)
     mule = supervisor.pids()["mule"]
     supervisor.stop()
     assert log.read_text().split() == ["house", "ground"]
@@ -240,7 +232,7 @@ def test_children_end_with_a_killed_supervisor() -> None:
     process.kill()
     process.wait(10)
     process.stdout.close()
-    until(lambda: not running(child), 5)
+    until(lambda: not running(child), seconds=5)
 
 
 def test_an_already_ended_parent_is_detected() -> None:

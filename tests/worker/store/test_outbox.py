@@ -42,6 +42,7 @@ from pliant.worker.webhooks.sender import (
     resolve,
     trusted_by_default,
 )
+from serving import until
 
 SECRET = "whsec_" + base64.b64encode(b"k" * 32).decode()
 LOOPBACK = "127.0.0.0/8"
@@ -110,7 +111,7 @@ def made(door: Jobs, inputs_file: Path, interpretation: Interpretation) -> Made:
 
     def call(url: str, *, end: bool = True, owner: str | None = None) -> Job:
         hook = Webhook(url=url, secret=SECRET)
-        job = (door if owner is None else door.of(owner)).submit(
+        job, _ = (door if owner is None else door.of(owner)).submit(
             inputs_file, Submission(options=Options(), name="hooked", webhook=hook), interpretation=interpretation
         )
         return door.cancel(job.id) if end else job
@@ -136,13 +137,6 @@ def webhook_sender(door: Jobs, soon: None) -> Iterator[WebhookSender]:
 def pending(outbox: Outbox) -> int:
     """The number of messages that are not sent yet."""
     return int(outbox._take.registered_client.zcard(f"{outbox._at}outbox"))
-
-
-def until(holds: Callable[[], object], *, seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < deadline, "it did not come to hold in time"
-        time.sleep(0.02)
 
 
 def test_the_end_of_a_job_is_sent_once_with_signature_and_body(
@@ -455,7 +449,7 @@ def test_a_retried_job_sends_its_webhook_and_a_job_without_one_does_not(
 ) -> None:
     again = retry(door, made(receiver.url).id)
     door.cancel(again.id)
-    plain = door.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)
+    plain = door.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)[0]
     assert door.cancel(plain.id).status is Status.CANCELLED
     assert pending(webhook_sender.outbox) == 2
     webhook_sender.start()

@@ -98,10 +98,14 @@ def _check_number(name: str, array: NDArray[np.generic], reading: Reading) -> No
     """
     frames, points = reading.points.shape[:2]
     if array.size > 2 * frames * points:
-        raise InvalidInput(
-            "wrong_shape", field=f"tracks.{name}", expected=f"({frames}, {points}), one value for each observation", got=str(array.shape),
-            hint="Visibility is (frames, points), in the order of the tracks.",
-        )  # fmt: skip
+        raise _wrong_shape(name, array, (frames, points))
+
+
+def _wrong_shape(name: str, array: NDArray[np.generic], like: tuple[int, ...]) -> InvalidInput:
+    return InvalidInput(
+        "wrong_shape", field=f"tracks.{name}", expected=f"{like}, one value for each observation", got=str(array.shape),
+        hint="Visibility is (frames, points), in the order of the tracks.",
+    )  # fmt: skip
 
 
 def _confidence(
@@ -175,7 +179,4 @@ def _arranged(flat: NDArray[np.float64], reading: Reading, name: str) -> NDArray
             else flat.reshape(2, like[0], like[1]).swapaxes(0, 1)
         )
         return np.ascontiguousarray(pairs.min(axis=1))
-    raise InvalidInput(
-        "wrong_shape", field=f"tracks.{name}", expected=f"{like}, one value for each observation", got=str(flat.shape),
-        hint="Visibility is (frames, points), in the order of the tracks.",
-    )  # fmt: skip
+    raise _wrong_shape(name, flat, like)

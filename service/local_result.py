@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.responses import FileResponse, JSONResponse, Response
+from pliant.schemas.digests import sha256
 from pliant.schemas.job import Artifact, Job, Status
 from pliant.schemas.problems import ProblemCode
 from pliant.service.middleware.security_headers import SecurityHeaders
@@ -92,8 +92,7 @@ def create_viewer(folder: Path, token: str) -> FastAPI:
 
 
 def _artifact(path: Path, stated: dict[str, Any]) -> Artifact:
-    with path.open("rb") as file:
-        digest = stated.get(path.name, {}).get("sha256") or hashlib.file_digest(file, "sha256").hexdigest()
+    digest = stated.get(path.name, {}).get("sha256") or sha256(path)
     media_type = MEDIA_TYPES.get(path.suffix, "application/octet-stream")
     return Artifact(name=path.name, media_type=media_type, bytes=path.stat().st_size, sha256=digest)
 
