@@ -31,7 +31,7 @@ from pliant.worker.settings import Settings
 
 logger = logging.getLogger(__name__)
 
-HEARTBEAT_SECONDS = 1.0
+JOB_HEARTBEAT_SECONDS = 1.0
 """Seconds between heartbeats; each also returns the job's status."""
 
 
@@ -104,7 +104,7 @@ class Watch:
         now = self.clock()
         self.stopping = stop_by is not None
         if now >= self._next_beat:
-            self._next_beat = now + HEARTBEAT_SECONDS
+            self._next_beat = now + JOB_HEARTBEAT_SECONDS
             self._look(now)
         grace, limit = self.settings.cancel_grace, self.limit
         if self.reason is Reason.STALE:
