@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import InvalidInput
+from pliant.solver.records import MIN_FRAMES, MIN_POINTS
 
 Array = NDArray[np.generic]
 
@@ -18,7 +19,7 @@ def without_ones(name: str, array: Array) -> tuple[Array, list[str]]:
     if array.ndim == 2:
         for matrix, turned, word in ((array, False, "row"), (array.T, True, "column")):
             third, odd = divmod(len(matrix), 3)
-            if odd or not third:
+            if odd or third < MIN_FRAMES or matrix.shape[1] < MIN_POINTS:
                 continue
             if _is_one(matrix[2::3]):
                 rest, which = np.delete(matrix, slice(2, None, 3), axis=0), f"every third {word}"
