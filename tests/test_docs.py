@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 RUN = {"python", "bash"}
 READ = {"json"}
-SHOWN = {"text", "mermaid", "http"}
+SHOWN = {"text", "mermaid", "http", "js"}
 """Languages that are run, parsed, or only shown."""
 
 LONG = {

@@ -19,7 +19,7 @@ import numpy as np
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.errors import TrackingStopped
 from pliant.tracking.flow import Bools, Floats, Grey, Match, best_of, dense_flow, match
-from pliant.tracking.registration import Registration
+from pliant.tracking.registration import ROUNDING, Registration
 
 DELTAS = (1, 8)
 """Offsets in frames, before t, of the candidates besides the template; MFT uses 1, 2, 4, 8, 16, 32. On four rendered films and 177 frames
@@ -64,13 +64,16 @@ class Chain:
     def confidence(self) -> Floats:
         """Median variance of the visible positions over a position's own, at most 1; 0 where hidden, shape `(F, P)`.
 
-        Positions in the template are exact. If most visible positions are in the template, the median excludes them.
+        Positions in the template, and in frames identical to it, are exact: half of their variance or more is `ROUNDING`. If most visible
+        positions are exact, as in a film whose object rests for a while, the median excludes them.
         """
         found = self.variance[self.visible]
-        elsewhere = found[found > 0]
-        if elsewhere.size == 0:
+        inexact = found[found > 2 * ROUNDING]
+        if inexact.size == 0:
             return self.visible.astype(np.float32)
-        usual = float(np.median(found)) or float(np.median(elsewhere))
+        usual = float(np.median(found))
+        if usual <= 2 * ROUNDING:
+            usual = float(np.median(inexact))
         return np.where(self.visible, usual / np.maximum(self.variance, usual), 0).astype(np.float32)
 
 

@@ -9,7 +9,7 @@ import pytest
 from pliant.tracking import chaining
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.chaining import Chain, _in_box, chain
-from pliant.tracking.registration import Registration
+from pliant.tracking.registration import ROUNDING, Registration
 from pliant.tracking.seeding import neighbours, place
 
 cv2 = pytest.importorskip("cv2")
@@ -105,6 +105,14 @@ def test_confidence_ignores_the_template_if_most_observations_are_in_it() -> Non
     assert (found[~visible] == 0).all()
     exact = Chain(np.zeros((4, 10, 2), np.float32), visible, np.zeros((4, 10), np.float32)).confidence
     assert (exact == visible).all()
+
+
+def test_confidence_ignores_frames_identical_to_the_template_if_most_observations_are_in_them() -> None:
+    visible, variance = np.ones((6, 10), bool), np.full((6, 10), 1.5 * ROUNDING, np.float32)
+    variance[0], variance[4], variance[5] = 0.0, 1.0, 2.0
+    found = Chain(np.zeros((6, 10, 2), np.float32), visible, variance).confidence
+    assert (found[:5] == 1).all()
+    assert found[5] == pytest.approx(0.75)
 
 
 def test_a_flow_in_another_box_keeps_its_places_and_repeats_its_border() -> None:

@@ -255,6 +255,8 @@ CASES: dict[str, Case] = {
         words="tracks: expected one video, got a batch of 2. Submit each element of the batch as its own job."),
     "a matrix of three rows": Case(tracks=lambda: npz(W=np.ones((3, 21))),
         words="tracks: expected (frames, points, 2) or a matrix of 2·frames rows, with 3 frames and 4 points or more, got W of shape (3, 21). Transpose or reshape the array; check the options layout and rows."),
+    "three rows per frame": Case(tracks=lambda: npz(W=np.concatenate([WALK, WALK[..., :1] + 500], axis=2).transpose(0, 2, 1).reshape(18, 20)),
+        words="tracks: expected two rows per frame, x and y, got W of shape (18, 20), which fits three interleaved rows per frame. Save only the rows of x and y. If it has two rows per frame, set rows=interleaved or rows=stacked."),
     "a layout that is not certain": Case(tracks=lambda: npz(W=np.random.default_rng(0).normal(size=(20, 20)) * 100 + 300),
         words="tracks: expected tracks whose layout is certain, got W of shape (20, 20), which can be read as W (P, 2F), columns interleaved or W (P, 2F), columns stacked or W (2F, P), rows stacked or W (2F, P), rows interleaved. Set the options of the correct one: layout=points_frames, rows=interleaved or layout=points_frames, rows=stacked or layout=frames_points, rows=stacked or layout=frames_points, rows=interleaved."),
     "two matrices": Case(tracks=lambda: mat(one={"W": WALK.reshape(12, 20)}, two={"W": WALK.reshape(12, 20)}),

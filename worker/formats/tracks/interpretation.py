@@ -19,6 +19,7 @@ from pliant.worker.formats.records import Arrays
 from pliant.worker.formats.tracks.dense import flatten
 from pliant.worker.formats.tracks.layouts import Reading, choose
 from pliant.worker.formats.tracks.pixels import Placed, place, project, sampled
+from pliant.worker.formats.tracks.third_rows import without_ones
 from pliant.worker.formats.tracks.tracker_formats import (
     INTRINSICS,
     OWN,
@@ -77,7 +78,9 @@ def understand(arrays: Arrays, options: Options, *, file: Path | None = None) ->
     if dialect.name == OWN:
         return _of_our_tracker(named, name, options)
     flat = flatten(name, _numeric(named[name], name))
-    array, depths, named = _two_numbers(flat.array, name, dialect, named)
+    spatial = dialect.third is not None or any(one in named for one in INTRINSICS)
+    array, ones = (flat.array, []) if spatial else without_ones(name, flat.array)
+    array, depths, named = _two_numbers(array, name, dialect, named)
     visibility = partial(find_visibility, named, grid=flat.grid, kind=options.visibility)
     reading, notes = choose(name, array, dialect=dialect, options=options, visibility=partial(_fitting, visibility))
     visible, how = visibility(reading)
@@ -101,7 +104,7 @@ def understand(arrays: Arrays, options: Options, *, file: Path | None = None) ->
         whose.append(note(names))
     return Understood(
         points=placed.points, visible=visible, format=dialect.name, layout=layout, coordinates=placed.coordinates,
-        y_axis=y_axis, grid=flat.grid, notes=[*whose, *notes, *placed.notes, *how, *why], arrays=named, name=name,
+        y_axis=y_axis, grid=flat.grid, notes=[*whose, *ones, *notes, *placed.notes, *how, *why], arrays=named, name=name,
         point_names=names,
     )  # fmt: skip
 

@@ -18,6 +18,7 @@ from pliant.solver import InvalidInput
 from pliant.solver.limits import MAX_COORDINATE
 from pliant.solver.records import MIN_FRAMES, MIN_POINTS
 from pliant.worker.formats.errors import AmbiguousInput
+from pliant.worker.formats.tracks.third_rows import as_triples, has_three_blocks, three_rows
 from pliant.worker.formats.tracks.tracker_formats import Dialect
 
 CONTRADICTED = 5.0
@@ -95,20 +96,18 @@ def usable(found: list[Reading]) -> list[Reading]:
     return [one for one in fit if one.points.shape[0] <= MANY_FRAMES] or fit or found[:1]
 
 
-def roughness(points: NDArray[np.generic], visible: NDArray[np.float64] | None = None) -> float:
-    """Return the mean step in time over the spread of the visible coordinates, for a sample; infinite if x and y are the same."""
-    count = points.shape[1]
-    chosen = np.unique(np.linspace(0, count - 1, COMPARED_POINTS).round().astype(int))
-    sample = np.asarray(points[: 4 * COMPARED_POINTS][:, chosen], dtype=np.float64)
-    sample = np.where(np.isfinite(sample) & (np.abs(sample) <= MAX_COORDINATE), sample, np.nan)
-    if visible is not None:
-        hidden = visible[: len(sample), chosen] == 0
-        if hidden.mean() < 1 - LEAST_FINITE:
-            sample[hidden] = np.nan
+def roughness(
+    points: NDArray[np.generic], visible: NDArray[np.float64] | None = None, *, spread: float | None = None
+) -> float:
+    """Return the mean step in time over the spread of the visible coordinates, for a sample; infinite if x and y are the same.
+
+    `spread` replaces that of these points, to compare interpretations of one matrix by their steps.
+    """
+    sample = _sample(points, visible)
     if np.isfinite(sample).all(axis=2).mean() < LEAST_FINITE:
         return float("inf")
+    spread = _spread(sample) if spread is None else spread
     with np.errstate(invalid="ignore", divide="ignore"):
-        spread = np.nanstd(sample, axis=(0, 1)).mean()
         step = _step(sample)
         centred = sample - np.nanmean(sample, axis=(0, 1))
         x, y = centred[..., 0], centred[..., 1]
@@ -121,6 +120,40 @@ def roughness(points: NDArray[np.generic], visible: NDArray[np.float64] | None =
     if len(alike) and np.isfinite(alike).any() and np.nanmedian(np.abs(alike)) > ALIKE:
         return float("inf")
     return float(step / spread) if spread > 0 else float("inf")
+
+
+def _sample(points: NDArray[np.generic], visible: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """Return the coordinates of some points in the first frames, NaN where they are not finite, too large or hidden."""
+    chosen = _sampled(points.shape[1])
+    sample = np.asarray(points[: 4 * COMPARED_POINTS][:, chosen], dtype=np.float64)
+    sample = np.where(np.isfinite(sample) & (np.abs(sample) <= MAX_COORDINATE), sample, np.nan)
+    if visible is not None:
+        hidden = visible[: len(sample), chosen] == 0
+        if hidden.mean() < 1 - LEAST_FINITE:
+            sample[hidden] = np.nan
+    return sample
+
+
+def _spread(sample: NDArray[np.float64]) -> float:
+    """Return the standard deviation of the coordinates `(F, P, 2)`, mean of x and y; NaN if none is known."""
+    if not np.isfinite(sample).any(axis=(0, 1)).all():
+        return float("nan")
+    return float(np.nanstd(sample, axis=(0, 1)).mean())
+
+
+def _spreads(found: list[Reading]) -> dict[str, float]:
+    """Return the smaller spread of each order of a matrix: rows of x that are read as y are spread as far as x is from y."""
+    spreads: dict[str, float] = {}
+    for one in found:
+        spread = _spread(_sample(one.points, None))
+        if spread > 0:
+            spreads[one.order] = min(spread, spreads.get(one.order, spread))
+    return spreads
+
+
+def _sampled(count: int) -> NDArray[np.intp]:
+    """Return the indices of the points that are compared."""
+    return np.unique(np.linspace(0, count - 1, COMPARED_POINTS).round().astype(np.intp))
 
 
 def _step(sample: NDArray[np.float64]) -> float:
@@ -145,7 +178,7 @@ def choose(
     Raises
     ------
     InvalidInput
-        Code wrong_shape if no interpretation fits; too_few_frames or too_few_points if every one has too few.
+        Code wrong_shape if none fits, or three rows per frame fit better; too_few_frames or too_few_points if every one has too few.
     AmbiguousInput
         Several interpretations fit.
     """
@@ -163,9 +196,13 @@ def choose(
     _check_size(name, array, allowed[0])
     if len(allowed) == 1:
         return allowed[0], []
-    costs = {one.layout: roughness(one.points, visibility(one)) for one in allowed}
+    spreads = _spreads(allowed) if array.ndim == 2 else {}
+    costs = {one.layout: roughness(one.points, visibility(one), spread=spreads.get(one.order)) for one in allowed}
     ranked = sorted(allowed, key=lambda one: costs[one.layout])
     documented = [one for one in ranked if order in (None, one.order) or options.layout != "auto"] or ranked
+    if array.ndim == 2 and options.rows == "auto":
+        cost, spread = costs[documented[0].layout], spreads.get(order or documented[0].order)
+        _check_triples(name, array, documented[0], order=order, cost=cost, spread=spread, visibility=visibility)
     best, others = documented[0], documented[1:]
     known = np.isfinite(costs[best.layout]) or not others or not np.isfinite(array).any()  # `Tracks` refuses the last
     clear = known and all(costs[other.layout] >= MIN_SMOOTHNESS_RATIO * costs[best.layout] for other in others)
@@ -198,6 +235,23 @@ def _check_documented(name: str, array: NDArray[np.generic], found: list[Reading
     if not documented or not others or _is_enough(documented[0]):
         return
     raise _too_few(name, array, documented[0], or_else=f"; if it is {others[0].layout}, set {_ways(others[:1])}")
+
+
+def _check_triples(
+    name: str, array: NDArray[np.generic], best: Reading, *, order: str | None, cost: float, spread: float | None,
+    visibility: Callable[[Reading], NDArray[np.float64] | None],
+) -> None:  # fmt: skip
+    """Refuse a matrix in which x, y and a third number of each frame fit better than its best interpretation as x and y."""
+    order = order or best.order
+    matrix = array if order == "frames_points" else array.T
+    if len(matrix) % 3:
+        return
+    blocks = best.order != order or best.rows == "stacked"
+    if blocks and np.isfinite(cost) and has_three_blocks(matrix[:, _sampled(matrix.shape[1])]):
+        raise three_rows(name, array, "stacked")
+    triples = Reading(name, order, "interleaved", as_triples(matrix))
+    if MIN_SMOOTHNESS_RATIO * roughness(triples.points, visibility(triples), spread=spread) < cost:
+        raise three_rows(name, array, "interleaved")
 
 
 def _check_size(name: str, array: NDArray[np.generic], reading: Reading) -> None:
