@@ -37,14 +37,13 @@ def as_triples(matrix: Array) -> Array:
 
 
 def has_three_blocks(matrix: Array) -> bool:
-    """Return whether x, y and z of `(3F, P)` are blocks: rows jump where y and z begin, and less at half, where y of `(2F, P)` begins."""
+    """Return whether x, y and z of `(3F, P)` are blocks: rows jump where y and z begin, by more than anywhere else."""
     rows = len(matrix)
     steps = np.abs(np.diff(np.asarray(matrix, dtype=np.float64), axis=0))
     known = np.isfinite(steps)
     means = np.where(known, steps, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-    y, half, z = rows // 3 - 1, rows // 2 - 1, 2 * rows // 3 - 1
-    jumps = [means[at] > max(means[at - 1], means[at + 1], means[half]) for at in (y, z)]
-    return all(jumps)
+    begins = [rows // 3 - 1, 2 * rows // 3 - 1]
+    return bool(means[begins].min() > np.delete(means, begins).max(initial=0.0))
 
 
 def three_rows(name: str, array: Array, rows: str) -> InvalidInput:

@@ -10,6 +10,7 @@ from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.solver.gallery import face
 from pliant.worker.formats.tracks.interpretation import understand
+from pliant.worker.formats.tracks.third_rows import has_three_blocks
 from track_files import HIDDEN, F, P
 
 Write = Callable[[np.ndarray], np.ndarray]
@@ -78,3 +79,13 @@ def test_the_option_rows_overrules_three_rows_per_frame() -> None:
     array = interleaved(np.concatenate([sequence.tracks.points, 300 + sequence.shapes[..., 2:]], axis=2))
     got = understand({"W": array}, Options.model_validate({"rows": "interleaved"}))
     assert got.points.shape == (30, 149, 2)
+
+
+def test_photographs_in_no_order_are_not_taken_for_three_blocks() -> None:
+    random = np.random.default_rng(0)
+    shape = random.normal(size=(60, 3))
+    taken = []
+    for count in range(12, 60, 3):
+        views = np.linalg.qr(random.normal(size=(count, 3, 3)))[0]
+        taken.append(has_three_blocks(np.concatenate([views[:, 0] @ shape.T, views[:, 1] @ shape.T])))
+    assert not any(taken)
