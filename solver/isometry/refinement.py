@@ -178,7 +178,8 @@ def _lower(graph: SurfaceGraph, here: _Point, damping: float, ease: float) -> tu
         total = float(lengths.sum())
         if total > 0:  # back to the scale of the start
             scale = float(here.lengths.sum()) / total
-            after = _at(graph, log_depths + np.log(scale), lengths * scale, ease)
+            with np.errstate(over="ignore", invalid="ignore"):  # depths too large to be represented are no decrease
+                after = _at(graph, log_depths + np.log(scale), lengths * scale, ease)
             if after.cost < here.cost:
                 return after, max(factor * damping, 1e-8)
         damping, factor = 10 * damping, 1.0

@@ -351,6 +351,8 @@ def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried, seed: int) -
         return None
     enter(search.should_stop, "sheet_error")
     shown = search.frames[enough[search.frames]]
+    if len(shown) == 0:
+        shown = np.flatnonzero(enough)[:SOLVED_FRAMES]
     deviations = standard_deviations(whole, found, points, shown, seed=seed, should_stop=search.should_stop)
     return IsometricSurface(
         all_of_it.points, all_of_it.outliers, all_of_it.placed, enough, chosen.focal,

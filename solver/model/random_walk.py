@@ -183,7 +183,7 @@ class WalkPosterior:
         for index in range(blocks - 2, -1, -1):
             after[index] = result[index + 1, :3] + corner[index + 1] @ after[index + 1]
         result += (self.coupling * self.inverses[:, :, -3:]) @ after
-        return result.reshape(-1, 3, count)[:frames]
+        return result.reshape(len(padded), 3, count)[:frames]
 
 
 def _block_pivots(blocks: Floats, coupling: float) -> tuple[Floats, float]:

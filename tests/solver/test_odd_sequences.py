@@ -234,3 +234,12 @@ def test_the_solution_warns_about_points_that_no_frame_connects() -> None:
     tracks = Tracks.from_arrays(film.tracks.points, visible)
     (warning,) = solve(tracks, cameras=cameras, settings=Settings(method="pseudo_inverse")).choices.warnings
     assert warning.startswith("No frame connects 30 of the points")
+
+
+def test_points_of_which_hardly_one_is_visible_twice_are_finite() -> None:
+    seen = np.zeros((8, 9))
+    for frame, points in enumerate(((), (4,), (1, 2, 6), (2,), (0,), (0, 5), (5, 6), (8,))):
+        seen[frame, list(points)] = 1
+    image = np.random.default_rng(0).uniform(100, 400, size=(8, 9, 2))
+    found = solve(Tracks.from_arrays(image, seen), settings=Settings(image_size=(640.0, 480.0)))
+    assert_finite(found, seen > 0)

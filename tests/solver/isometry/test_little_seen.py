@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from pliant.solver import Outcome, Settings, Tracks, gallery, solve
-from pliant.solver.isometry import surface
+from pliant.solver.isometry import refinement, surface
+from pliant.solver.isometry.anchors import nearest_neighbours
 from pliant.solver.isometry.extension import complete_anchors
-from rolled_sheets import FOCAL, SIZE, one_scale_error, rolled
+from pliant.solver.isometry.inextensible import SurfaceGraph
+from rolled_sheets import CENTRE, FOCAL, SIZE, one_scale_error, rolled
 
 GIVEN = Settings(surface="isometric", focal=FOCAL, image_size=SIZE, order="film")
 
@@ -99,3 +103,38 @@ def test_a_stop_before_surface_refinement_is_reported() -> None:
         sheet.tracks, focal=FOCAL, image_size=SIZE, required=True, should_stop=lambda: True
     )
     assert verdict.reason.startswith("Stopped before")
+
+
+def test_frames_of_the_search_that_show_too_little_are_replaced_for_the_standard_deviations(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    searches, search, complete = [], surface._search, surface.complete_anchors
+
+    def noted(*given: Any) -> Any:
+        searches.append(search(*given))
+        return searches[-1]
+
+    def others_only(*given: Any) -> Any:
+        filled, enough = complete(*given)
+        return filled, enough & ~np.isin(np.arange(len(enough)), searches[-1].frames)
+
+    monkeypatch.setattr(surface, "_search", noted)
+    monkeypatch.setattr(surface, "complete_anchors", others_only)
+    found = surface.isometric_surface(
+        rolled(frames=28, side=6).tracks, focal=FOCAL, image_size=SIZE, required=True
+    ).surface
+    assert found is not None
+    assert found.shown.sum() == 28 - surface.SOLVED_FRAMES
+    assert np.isfinite(found.deviations).all()
+
+
+def test_steps_to_depths_that_cannot_be_represented_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    sheet = rolled(frames=4, side=5)
+    images = (sheet.tracks.points - np.array(CENTRE)) / FOCAL
+    rays = np.concatenate([images, np.ones((4, 25, 1))], axis=2)
+    graph = SurfaceGraph(rays, np.ones((4, 25)), nearest_neighbours(images, np.ones((4, 25)) > 0))
+    begun = sheet.points[..., 2] * np.exp(np.random.default_rng(0).normal(0, 0.01, (4, 25)))
+    monkeypatch.setattr(
+        refinement, "gauss_newton_step", lambda graph, normal, gradient, damping: 1000 * np.sign(gradient)
+    )
+    np.testing.assert_allclose(refinement.refine(graph, begun).depths, begun, rtol=1e-12)
