@@ -139,7 +139,8 @@ def depth_map(rotations: Floats, scales: Floats, covariance: ShapeCovariance) ->
     away, rows = rotations[:, 2] * scales[:, None], projections.reshape(-1, 3)
     wide = np.repeat(covariance.over_frames(), 2, axis=1)
     cross = away @ covariance.mean_covariance @ rows.T + (away @ covariance.axis_covariance @ rows.T) * wide
-    return np.asarray(linalg.solve(covariance.of_image(projections), cross.T, assume_a="pos").T)
+    factor = linalg.cho_factor(covariance.of_image(projections))  # `solve` would warn of hardly observed tracks
+    return np.ascontiguousarray(linalg.cho_solve(factor, cross.T)).T
 
 
 def depths_of(

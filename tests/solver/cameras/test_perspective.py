@@ -164,6 +164,12 @@ def test_depths_match_the_true_shape_at_low_noise() -> None:
     assert depth_map(turned, np.ones(20), other) == pytest.approx(-depth)
 
 
+def test_hardly_observed_tracks_give_no_warning_about_their_covariance() -> None:
+    rotations, covariance = a_covariance(20)
+    covariance = replace(covariance, modes=0 * covariance.modes, walk_variance=1e-15, noise_variance=1e-15)
+    assert np.isfinite(depth_map(rotations, np.ones(20), covariance)).all()
+
+
 def test_the_corrected_energy_gradient_matches_finite_differences() -> None:
     rotations, covariance = a_covariance()
     random = np.random.default_rng(6)
