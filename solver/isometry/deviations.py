@@ -31,8 +31,8 @@ EXCHANGES = 3
 
 MODEL_STD = 0.01
 """Standard deviation of the positions of sheets that is not in the bootstrap, relative to the size. Chosen with recorded paper and a comic
-page, whose errors of .018 and .035 are 4.8 and 3.9 times those of the bootstrap, and made-up paper at d = 4, for which they are .9 to 1.6
-times: all of them are then about the middle of `evaluation.trust.INTERVAL` or inside it."""
+page, whose errors of .018 and .035 are 4.8 and 3.9 times those of the bootstrap, and made-up paper at d = 4, where they are .9 to 1.6
+times. With it, they are 1.5, 2.1 and .3 to .5 times the expected error."""
 
 FOCAL_MODEL_STD = 0.02
 """The same for the focal length, relative to it. Chosen with the same sheets, whose focal lengths are off by .1 to 2.1 %; bootstrap .1 to
