@@ -58,6 +58,9 @@ NO_POSTERIOR = "Only the learned prior, the default, estimates the error. Here n
 """Reason of a free surface whose prior is not the learned one, or has weight 0. On clean recorded sequences with estimated cameras
 (`benchmarks.accuracy`), errors of the method `pseudo_inverse` are .19 to .73, those of the smooth prior .002 to .17."""
 
+UNESTIMATED = "The solve was stopped before its error was estimated."
+"""Reason of an isometric surface without standard deviations."""
+
 FLEXIBLE = 0.5
 """Modes of deformation per frame above which the motion hardly determines depth: one independent shape every second frame."""
 
@@ -221,7 +224,7 @@ def assess_isometric(solution: Solution, *, ordered: bool, doubted: bool) -> Tru
     Parameters
     ----------
     solution : Solution
-        With standard deviations.
+        With standard deviations, unless the solve was stopped before they were computed.
     ordered : bool
         Whether the frames are in the order of a film.
     doubted : bool
@@ -231,7 +234,9 @@ def assess_isometric(solution: Solution, *, ordered: bool, doubted: bool) -> Tru
     expected, (residual, hidden) = _expected(solution), _fit(solution, solution.weights, size_of(shapes))
     turning, deforming = per_frame(shapes, rotations) if ordered else (None, None)
     warned = [(Verdict.WITH_CARE, warning) for warning in solution.choices.warnings]
-    errors = _error_signs(expected, None, bounded=not doubted)
+    errors = (
+        [(Verdict.WITH_CARE, UNESTIMATED)] if expected is None else _error_signs(expected, None, bounded=not doubted)
+    )
     verdict, reasons = _most_serious_first([*warned, *_observation_signs(residual, hidden), *errors])
     return Trust(
         verdict, reasons, expected, None if doubted else _interval(expected), turned(rotations), residual, hidden,

@@ -61,8 +61,8 @@ def standard_deviations(
     *,
     seed: int,
     should_stop: ShouldStop = never,
-) -> Deviations:
-    """Return the standard deviations of positions and focal length.
+) -> Deviations | None:
+    """Return the standard deviations of positions and focal length; None if stopped before one reconstruction was complete.
 
     Positions are those for a known focal length, whose error adds little to theirs.
 
@@ -79,11 +79,11 @@ def standard_deviations(
     seed : int
         Of the noise.
     should_stop : callable, optional
-        Called between steps; once it returns True, the differences found so far count.
+        Called between steps; once it returns True, the reconstructions completed so far count.
     """
     frames = np.sort(frames)
     part, shapes = graph.of(frames), points[frames]
-    random, squares, off = np.random.default_rng(seed), np.zeros((EXCHANGES, shapes.shape[1])), np.zeros(EXCHANGES)
+    random, squares, off = np.random.default_rng(seed), list[Floats](), list[float]()
     noise = noise_of(found, shapes)
     for exchange in range(EXCHANGES):
         truth = exchanged(shapes, (exchange + 1) * len(frames) // (EXCHANGES + 1))
@@ -91,10 +91,15 @@ def standard_deviations(
         again = refine(seen, np.where(part.seen, truth[..., 2], 0.0), should_stop=should_stop)
         again = refine_along_surface(seen, again, should_stop=should_stop)
         share = found.inconsistency / again.inconsistency if again.inconsistency > 0 else 1.0
-        squares[exchange] = share**2 * _mean_squares(again.depths[..., None] * seen.rays, truth, part.seen)
-        off[exchange] = share * focal_offset(seen, again, should_stop=should_stop)
+        offset = focal_offset(seen, again, should_stop=should_stop)
+        if should_stop():
+            break
+        squares.append(share**2 * _mean_squares(again.depths[..., None] * seen.rays, truth, part.seen))
+        off.append(share * offset)
+    if not squares:
+        return None
     return Deviations(
-        np.sqrt(squares.mean(axis=0) + (MODEL_STD * size_of(shapes)) ** 2),
+        np.sqrt(np.mean(squares, axis=0) + (MODEL_STD * size_of(shapes)) ** 2),
         float(np.hypot(np.sqrt(np.square(off).mean()), FOCAL_MODEL_STD)),
     )
 

@@ -117,11 +117,11 @@ class IsometricSurface:
     principal_point: tuple[float, float]
     """Given or assumed principal point, pixels."""
 
-    focal_std: float
-    """Standard deviation of an estimated focal length, pixels."""
+    focal_std: float | None
+    """Standard deviation of an estimated focal length, pixels; None if stopped before it was computed."""
 
-    deviations: Floats
-    """Standard deviations of the points' positions, the same in all frames, shape `(P,)`, the unit of `points`."""
+    deviations: Floats | None
+    """Standard deviations of the points' positions, the same in all frames, shape `(P,)`, the unit of `points`; None as `focal_std`."""
 
     inconsistency: float
     """I of the anchors over all frames."""
@@ -357,8 +357,10 @@ def _everywhere(search: FocalSearch, tracks: Tracks, chosen: Tried, seed: int) -
     return IsometricSurface(
         all_of_it.points, all_of_it.outliers, all_of_it.placed, enough, chosen.focal,
         (float(search.centre[0]), float(search.centre[1])),
-        chosen.focal * deviations.focal,
-        deviations_at(all_of_it.places, all_of_it.placed, deviations.points, template=template, size=size_of(points)),
+        None if deviations is None else chosen.focal * deviations.focal,
+        None if deviations is None else deviations_at(
+            all_of_it.places, all_of_it.placed, deviations.points, template=template, size=size_of(points)
+        ),
         found.inconsistency, search.anchors.noise_std,
     )  # fmt: skip
 

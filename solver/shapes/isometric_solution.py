@@ -63,8 +63,10 @@ def isometric_solution(
     return replace(solution, trust=trust)
 
 
-def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera, Floats]:
+def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera, Floats | None]:
     """Return centred shapes `(F, P, 3)` in world axes, cameras that reproduce the images of the surface, and standard deviations `(F, P)`.
+
+    The latter are None if the surface has none.
 
     A frame that copies the shape of another one may differ from it by the deformation of the surface, which is added to its variance.
     """
@@ -76,9 +78,11 @@ def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera, Floats]:
     shapes = unit * (centred @ rotations)
     point = np.array(surface.principal_point)
     translations = point + scales[:, None] * origin[:, :2]
+    camera = Camera(rotations, scales / unit, translations, surface.focal, principal_point=point)
+    if surface.deviations is None:
+        return shapes, camera, None
     deformation = np.square(shapes - shapes.mean(axis=0)).sum(axis=2).mean(axis=0)
     variance = np.square(unit * surface.deviations) + np.where(surface.shown[:, None], 0.0, deformation)
-    camera = Camera(rotations, scales / unit, translations, surface.focal, principal_point=point)
     return shapes, camera, np.sqrt(variance)
 
 

@@ -9,11 +9,13 @@ import pytest
 from numpy.typing import NDArray
 from pliant.solver import Tracks, solve
 from pliant.solver.evaluation.metrics import e3d_frame_scaled
-from pliant.solver.evaluation.trust import size_of
+from pliant.solver.evaluation.trust import UNESTIMATED, Verdict, size_of
+from pliant.solver.isometry import surface
 from pliant.solver.isometry.anchors import nearest_neighbours
 from pliant.solver.isometry.deviations import (
     FOCAL_MODEL_STD,
     MODEL_STD,
+    Deviations,
     deviations_at,
     exchanged,
     focal_offset,
@@ -43,11 +45,17 @@ def refined(graph: SurfaceGraph, sheet: RolledSheet) -> tuple[Isometry, Floats]:
     return found, found.depths[..., None] * graph.rays
 
 
+def measured(graph: SurfaceGraph, found: Isometry, points: Floats, *, seed: int = 0) -> Deviations:
+    std = standard_deviations(graph, found, points, np.arange(10), seed=seed)
+    assert std is not None
+    return std
+
+
 def deviations(noise: float, *, seed: int = 0) -> Floats:
     sheet = rolled(frames=10)
     graph = noisy(sheet, noise)
     found, points = refined(graph, sheet)
-    return standard_deviations(graph, found, points, np.arange(10), seed=seed).points / size_of(sheet.points)
+    return measured(graph, found, points, seed=seed).points / size_of(sheet.points)
 
 
 def test_noise_is_that_of_edges_parallel_to_the_picture() -> None:
@@ -119,7 +127,7 @@ def test_deviations_are_about_the_errors(noise: float) -> None:
     sheet = rolled(frames=10)
     graph = noisy(sheet, noise)
     found, points = refined(graph, sheet)
-    std = standard_deviations(graph, found, points, np.arange(10), seed=0).points
+    std = measured(graph, found, points).points
     expected = np.sqrt(np.square(std).mean())
     error = e3d_frame_scaled(points, sheet.points)
     assert 0.5 < error / (expected / size_of(sheet.points)) < 2
@@ -140,19 +148,49 @@ def test_hidden_anchors_do_not_count() -> None:
     graph = replace(graph, confidence=shown)
     found = refine(graph, np.where(shown > 0, sheet.points[..., 2], 0.0))
     points = np.where(shown[..., None] > 0, found.depths[..., None] * graph.rays, sheet.points)
-    std = standard_deviations(graph, found, points, np.arange(10), seed=0).points
+    std = measured(graph, found, points).points
     assert std[5] == pytest.approx(np.sqrt(np.square(np.delete(std, 5)).mean()), rel=0.05)
     assert std.max() < 5 * np.median(std)
 
 
-def test_a_stop_leaves_finite_deviations() -> None:
+def test_reconstructions_completed_before_a_stop_count() -> None:
     sheet = rolled(frames=10)
     graph = noisy(sheet, 1.0)
     found, points = refined(graph, sheet)
-    stopped = standard_deviations(graph, found, points, np.arange(10), seed=0, should_stop=lambda: True)
-    assert (stopped.points > 0).all()
-    assert np.isfinite(stopped.points).all()
-    assert np.isfinite(stopped.focal)
+    questions = 0
+
+    def stop_after(most: float) -> Deviations | None:
+        nonlocal questions
+        questions = 0
+
+        def should_stop() -> bool:
+            nonlocal questions
+            questions += 1
+            return questions > most
+
+        return standard_deviations(graph, found, points, np.arange(10), seed=0, should_stop=should_stop)
+
+    whole = stop_after(np.inf)
+    assert whole is not None
+    total = questions
+    part = stop_after(total - 1)  # in the last question of the third reconstruction
+    assert part is not None
+    assert 0.5 < np.sqrt(np.square(part.points).mean() / np.square(whole.points).mean()) < 2
+    assert (part.points != whole.points).any()
+    assert stop_after(0) is None
+    assert stop_after(total // 6) is None
+
+
+def test_a_stop_before_the_error_is_estimated_is_a_reason_for_care(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(surface, "standard_deviations", lambda *given, **named: None)
+    sheet = rolled(frames=8, side=6)
+    found = solve(sheet.tracks, settings=Settings(image_size=SIZE, surface="isometric"))
+    assert found.trust is not None
+    assert found.trust.depth_from_lengths
+    assert (found.shapes_std, found.trust.expected_error, found.trust.interval) == (None, None, None)
+    assert found.camera.focal_std is None
+    assert found.trust.verdict is Verdict.WITH_CARE
+    assert UNESTIMATED in found.trust.reasons
 
 
 @pytest.mark.parametrize("ratio", [0.96, 1.0, 1.05])
@@ -169,7 +207,7 @@ def test_the_focal_length_is_less_certain_with_noise() -> None:
 
     def focal(noise: float) -> float:
         graph = noisy(sheet, noise)
-        return standard_deviations(graph, *refined(graph, sheet), np.arange(10), seed=0).focal
+        return measured(graph, *refined(graph, sheet)).focal
 
     assert FOCAL_MODEL_STD <= focal(0.0) < 1.2 * FOCAL_MODEL_STD
     assert focal(0.0) < focal(1.0) < 0.1
