@@ -102,7 +102,7 @@ class Trust:
     """Interval that contains the true error in three of four solves of `benchmarks.trust`.
 
     Where a motion of the camera would explain the deformation as well, the error can be larger: the interval contains
-    fewer than half of those in `benchmarks.accuracy.kinds`. None without a posterior, where the model is doubtful, or
+    about half of those in `benchmarks.accuracy.kinds`. None without a posterior, where the model is doubtful, or
     below `NARROW` degrees of turn.
     """
 

@@ -1,10 +1,11 @@
 """Standard deviations of the positions of an isometric surface, by a parametric bootstrap.
 
 No truth is known, but the reconstruction is a surface of about the same kind seen in about the same poses. The bootstrap takes it as the
-truth: its images, with noise, are reconstructed as the tracks were, and the differences are errors of the method on such a surface (Efron
-and Tibshirani, "An Introduction to the Bootstrap", 1993, section 6.5). Every shape is seen in the pose of another frame; in its own pose it
-would have the images of the tracks, and the same errors again. The noise follows from the inconsistency I of the edge lengths. It differs
-from that of the tracks where edges hide it, or where the surface stretches a little, so differences are scaled to the I of the tracks.
+truth: its images, with noise, are refined again, starting from the truth, and the differences are errors of the method on such a surface
+(Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, section 6.5). Starting from the conic program, as for the tracks, gives
+about the same differences in eight times the time. Every shape is seen in the pose of another frame; in its own pose it would have the
+images of the tracks, and the same errors again. The noise follows from the inconsistency I of the edge lengths. It differs from that of the
+tracks where edges hide it, or where the surface stretches a little, so differences are scaled to the I of the tracks.
 
 What recorded sheets have beyond the model is not in the bootstrap: they stretch, lenses distort, the principal point is not the centre of
 the picture. `MODEL_STD` and `FOCAL_MODEL_STD` are added for it.
