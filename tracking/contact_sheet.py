@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.storage import let_go
 
 if TYPE_CHECKING:
     from pliant.tracking.records import TrackedFilm
@@ -34,6 +35,7 @@ def view_of(tracks: NDArray[np.float32], visible: NDArray[np.bool_], size: tuple
     for points, seen in zip(tracks, visible, strict=True):  # one frame at a time, to save memory
         low = points.min(axis=0, where=seen[:, None], initial=np.inf).clip(max=low)
         high = points.max(axis=0, where=seen[:, None], initial=-np.inf).clip(min=high)
+        let_go(tracks, visible)
     whole = np.array(size)
     share = min(1.0, float(((high - low + 1) * (1 + 2 * MARGIN) / whole).max()))
     extent = np.maximum(1, np.round(share * whole)).astype(int)
