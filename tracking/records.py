@@ -151,9 +151,9 @@ class TrackedFilm:
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     _write_array(member, array)
 
-    def contact_sheet(self) -> bytes:
-        """Draw the tracks over some frames, as one small JPEG picture."""
-        return draw_contact_sheet(self)
+    def contact_sheet(self, *, png: bool = False) -> bytes:
+        """Draw the tracks over some frames, as one small JPEG or PNG picture."""
+        return draw_contact_sheet(self, png=png)
 
 
 def _write_array(file: IO[bytes], array: NDArray[Any]) -> None:
