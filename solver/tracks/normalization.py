@@ -63,8 +63,9 @@ def normalize(tracks: Tracks) -> Normalized:
     unit = float(np.sqrt(np.einsum("fp,fpc,fpc->", weight, points, points) / total.sum()))
     if not unit > 1e-12 * max(float(np.abs(centroid).max()), np.finfo(float).tiny):
         raise InvalidInput(
-            "no_extent", field="tracks", expected="points that differ from each other", got="one position for all points",
-            hint="Check that the points' axis is the second one and that the tracks are not all zero.",
+            "no_extent", field="tracks", expected="points that differ from each other in a frame",
+            got="one position for all visible points of each frame",
+            hint="Check that the points' axis is the second one, that the tracks are not all zero, and that frames show several points.",
         )  # fmt: skip
     points /= unit
     read_only(points)
