@@ -311,6 +311,8 @@ CASES: dict[str, Case] = {
         words="options.stride: expected a value that leaves 4 points or more, got 1 of 20. Use a smaller stride."),
     "points that are seen too seldom": Case(options={"min_seen": 7},
         words="options.min_seen: expected points that are visible in 7 or more frames, got none of 20. Set min_seen lower."),
+    "points that are visible once": Case(tracks=lambda: npz(tracks=WALK, visibility=np.arange(20) % 6 == np.arange(6)[:, None]), options={"layout": "frames_points"},
+        words="visibility: expected at least 4 points that are visible in two or more frames, got 0. Check that the visibility is not inverted, and that a point has the same index in every frame."),
     "a mesh of other arrays": Case(mesh=lambda: npz(vertices=np.ones((20, 3))),
         words="mesh: expected faces, or grid, got vertices (20, 3). Save the faces as numpy.savez('mesh.npz', faces=faces)."),
     "a grid of another size": Case(mesh="3x5",
