@@ -93,8 +93,11 @@ def _near(tracks: Tracks, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
             middle = np.median(tracks.points[frame, mask], axis=0)
             radius[frame] = np.hypot(*(tracks.points[frame] - middle).T)
     pulse()
-    near &= radius <= MAX_MEDIAN_RADII * _median(radius[seen])
-    return near if near.any() else seen
+    typical = _median(radius[seen])
+    if typical == 0:  # as where most frames show a single point
+        return seen
+    near &= radius <= MAX_MEDIAN_RADII * typical
+    return near
 
 
 def _median(values: Floats) -> float:
