@@ -174,7 +174,7 @@ def _track(run: Run, found: Survey, plan: Plan, step: float | None, *, whole: bo
     kept_grid, kept = keep(seeds.grid, often & moving)
     if len(kept) < LEAST_POINTS:
         raise FilmError(
-            "tracks_lost", field="film", 
+            "tracks_lost", field="film",
             expected=f"at least {LEAST_POINTS} points that stay visible in {LEAST_SEEN:.0%} of the frames, and in two or more",
             got=str(len(kept)),
             hint=FILM_SLOWLY,
