@@ -80,13 +80,13 @@ class Chain:
         """Release the memory of stored arrays; their files are read when they are used again."""
         let_go(self.points, self.visible, self.variance)
 
-    def share_seen(self) -> NDArray[np.float64]:
-        """Return the share of the frames in which every point is visible, shape `(P,)`."""
+    def times_seen(self) -> NDArray[np.int64]:
+        """Return the number of frames in which every point is visible, shape `(P,)`."""
         count = np.zeros(self.visible.shape[1], np.int64)
         for seen in self.visible:
             count += seen
             let_go(self.visible)
-        return count / len(self.visible)
+        return count
 
     def usual_variance(self) -> float | None:
         """Return the median variance of the visible positions in at most `JUDGED_FRAMES` frames; None if all are exact.

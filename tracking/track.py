@@ -169,10 +169,12 @@ def _track(run: Run, found: Survey, plan: Plan, step: float | None, *, whole: bo
         pool=run.pool, on_frame=reporter("refine"), should_stop=run.should_stop,
         on_part=lambda done, total: run.on_step(TrackingStep("fit", done, total)),
     )  # fmt: skip
-    kept_grid, kept = keep(seeds.grid, chained.share_seen() >= LEAST_SEEN)
+    seen = chained.times_seen()
+    kept_grid, kept = keep(seeds.grid, (seen / length >= LEAST_SEEN) & (seen >= 2))  # in the template alone, no point moves
     if len(kept) < LEAST_POINTS:
         raise FilmError(
-            "tracks_lost", field="film", expected=f"at least {LEAST_POINTS} points that stay visible in {LEAST_SEEN:.0%} of the frames",
+            "tracks_lost", field="film",
+            expected=f"at least {LEAST_POINTS} points that stay visible in {LEAST_SEEN:.0%} of the frames, and in two or more",
             got=str(len(kept)),
             hint=FILM_SLOWLY,
         )  # fmt: skip
