@@ -169,8 +169,8 @@ def _track(run: Run, found: Survey, plan: Plan, step: float | None, *, whole: bo
         pool=run.pool, on_frame=reporter("refine"), should_stop=run.should_stop,
         on_part=lambda done, total: run.on_step(TrackingStep("fit", done, total)),
     )  # fmt: skip
-    seen = chained.times_seen()
-    kept_grid, kept = keep(seeds.grid, (seen / length >= LEAST_SEEN) & (seen >= 2))  # in the template alone, no point moves
+    seen = chained.times_seen()  # once is in the template alone, where no point moves
+    kept_grid, kept = keep(seeds.grid, (seen / length >= LEAST_SEEN) & (seen >= 2))
     if len(kept) < LEAST_POINTS:
         raise FilmError(
             "tracks_lost", field="film",
