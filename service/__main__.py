@@ -8,7 +8,6 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 
 import uvicorn
 from fastapi import FastAPI
@@ -16,11 +15,12 @@ from pliant.service.app import create_app
 from pliant.service.settings import ServiceSettings
 from pliant.worker import tracing
 from pliant.worker.environment import variable_of, warnings_of_unknown
-from pliant.worker.errors import InvalidSetting, StoreUnavailable, WorkerError
+from pliant.worker.errors import InvalidSetting, StoreForbidden, StoreUnavailable, WorkerError
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.logs import configure_logging
 from pliant.worker.processes.preflight import check_process, open_data_directory
 from pliant.worker.settings import Settings
+from pliant.worker.store.outage import described
 from pliant.worker.tokens import Tokens
 
 _log = logging.getLogger("pliant.service")
@@ -64,6 +64,8 @@ def check_access(settings: ServiceSettings, tokens: Tokens) -> None:
     ------
     InvalidSetting
         There is no valid token; the message names both remedies.
+    StoreForbidden
+        The store forbids reading the tokens.
     """
     if not settings.asks_for_tokens:
         if not settings.loopback:
@@ -73,6 +75,8 @@ def check_access(settings: ServiceSettings, tokens: Tokens) -> None:
         return
     try:
         usable = tokens.usable()
+    except StoreForbidden:
+        raise
     except StoreUnavailable:
         return  # requests are answered 503 until the store is back
     if not usable:
@@ -83,6 +87,24 @@ def check_access(settings: ServiceSettings, tokens: Tokens) -> None:
             hint="Create one with `pliant token create NAME`, with the same PLIANT_DATA or PLIANT_REDIS_URL, then start again; "
             "or set PLIANT_AUTH=off if a proxy controls access.",
         )
+
+
+def check_store(jobs: Jobs) -> None:
+    """Check the version of the records, if the store answers; if not, requests are answered 503 until it does.
+
+    Raises
+    ------
+    NewerData
+        The records were written by a newer version.
+    StoreForbidden
+        The store forbids a command.
+    """
+    try:
+        jobs.records.ping()
+    except StoreForbidden:
+        raise
+    except StoreUnavailable:
+        return
 
 
 def print_openapi(*, schemas_only: bool) -> None:
@@ -110,9 +132,11 @@ def main(arguments: Sequence[str] = ()) -> int:
         check_process(of_worker)
         tracing.configure(of_worker.tracing, service="pliant-api")
         jobs = Jobs.open(of_worker)
-        with suppress(StoreUnavailable):  # requests are answered 503 until the store is back
-            jobs.records.ping()
+        check_store(jobs)
         app = create_app(jobs, settings, tokens=tokens)
+    except StoreForbidden as error:
+        sys.stderr.write(f"{described(error, of_worker.redis)}\n")
+        return 2
     except WorkerError as error:
         sys.stderr.write(f"{error}\n")
         return 2

@@ -67,7 +67,9 @@ def work(settings: Settings) -> int:
             queue=RedisQueue(connection, name=settings.queue),
             name=secrets.token_hex(6),
         )
-    worker.work(logging_level=None)
+        worker.work(logging_level=None)
+        if worker.forbidden is not None:
+            raise worker.forbidden
     return 0
 
 

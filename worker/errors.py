@@ -208,6 +208,19 @@ class StoreUnavailable(WorkerError):
         self.what, self.reason = what, reason
 
 
+class StoreForbidden(StoreUnavailable):
+    """The access rules (ACL) of Redis forbid its user a command, a key or a channel that Pliant needs."""
+
+    remedy = "Grant it to the user in PLIANT_REDIS_URL; docs/how-to/two-hosts.md lists the access rules."
+
+    def __init__(self, forbidden: str) -> None:
+        reason = f"its access rules forbid {forbidden}"
+        super().__init__(JOB_STORE, reason=reason)
+        self.args = (
+            f"{JOB_STORE} is unavailable ({reason}). No data was lost; the operator must grant the permission.",
+        )
+
+
 class DataDirectoryInUse(WorkerError):
     """Another Pliant process uses the data directory."""
 
