@@ -19,6 +19,7 @@ from pliant.worker.errors import InvalidSetting, StoreForbidden, StoreUnavailabl
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.logs import configure_logging
 from pliant.worker.processes.preflight import check_process, open_data_directory
+from pliant.worker.records import utc_now
 from pliant.worker.settings import Settings
 from pliant.worker.store.outage import described
 from pliant.worker.tokens import Tokens
@@ -58,12 +59,14 @@ def stop_streams(app: FastAPI) -> None:
 
 
 def check_access(settings: ServiceSettings, tokens: Tokens) -> None:
-    """Refuse to start if tokens are required and none is valid, because nobody could use the service.
+    """Refuse to start if tokens are required and there is none, because nobody could use the service.
+
+    If all have expired, it starts with a warning: share links still work, and a new token needs no restart.
 
     Raises
     ------
     InvalidSetting
-        There is no valid token; the message names both remedies.
+        There is no token; the message names both remedies.
     StoreForbidden
         The store forbids reading the tokens.
     """
@@ -74,15 +77,22 @@ def check_access(settings: ServiceSettings, tokens: Tokens) -> None:
             )
         return
     try:
-        usable = tokens.usable()
+        found = tokens.all()
     except StoreForbidden:
         raise
     except StoreUnavailable:
         return  # requests are answered 503 until the store is back
-    if not usable:
+    if found and all(token.expired(utc_now()) for token in found):
+        last = max(found, key=lambda token: token.expires_at or token.created_at)
+        _log.warning(
+            "every token has expired, the last one (%s, for %s) on %s: requests with them are refused. Create another with `pliant token "
+            "create NAME --sharing %s`, with the same PLIANT_DATA or PLIANT_REDIS_URL; it is valid at once.",
+            last.id, last.name, f"{last.expires_at:%Y-%m-%d %H:%M} UTC", last.id,
+        )  # fmt: skip
+    if not found:
         raise InvalidSetting(
             variable_of("auth"),
-            expected=f"a valid token for requests to {settings.host}",
+            expected=f"a token for requests to {settings.host}",
             got="none",
             hint="Create one with `pliant token create NAME`, with the same PLIANT_DATA or PLIANT_REDIS_URL, then start again; "
             "or set PLIANT_AUTH=off if a proxy controls access.",
