@@ -19,9 +19,9 @@ from typing import Any
 
 import redis
 from pliant.schemas.job import Status
-from pliant.worker.errors import StoreUnavailable, UnknownJob
+from pliant.worker.errors import ForeignStore, StoreUnavailable, UnknownJob
 from pliant.worker.execution import attempt as work
-from pliant.worker.execution.failures import UNRECORDED
+from pliant.worker.execution.failures import FOREIGN_STORE, UNRECORDED, was_foreign
 from pliant.worker.execution.monitor import RetryDeadline, Watch, finalize
 from pliant.worker.execution.workdir import clean_up
 from pliant.worker.jobs.lifecycle import ACTIVE
@@ -81,6 +81,8 @@ class Delivery(RqJob):
             logger.warning("job %s: the outcome is not recorded: %s", arguments[0], error, extra={"job": arguments[0]})
             # RQ would end with the code of any error, and the worker could not tell an outage from a crash.
             os._exit(UNRECORDED)
+        except ForeignStore:  # the worker reports it
+            os._exit(FOREIGN_STORE)
 
     @property
     def success_callback(self) -> None:
@@ -128,6 +130,8 @@ class PliantWorker(Worker):
         self._memory = memory_for_a_job(settings)
         self.forbidden: redis.exceptions.NoPermissionError | None = None
         """The missing permission that the worker has ended with."""
+        self.foreign_store = False
+        """Whether the worker has ended because no job has its files in its blob store."""
 
     def subscribe(self) -> None:
         """Do not listen for commands: jobs are cancelled through their record, and forking is safer without threads."""
@@ -166,8 +170,10 @@ class PliantWorker(Worker):
             logger.warning("heartbeat not written: %s", error)
 
     def dequeue_job_and_maintain_ttl(self, timeout: int | None, max_idle_time: int | None = None) -> Any:
-        """Wait for a delivery; stop if the store forbids it, since RQ would only log a traceback."""
+        """Wait for a delivery; stop if the store forbids it, since RQ would only log a traceback, or if the files are elsewhere."""
         try:
+            if self.foreign_store:
+                raise StopRequested
             return super().dequeue_job_and_maintain_ttl(timeout, max_idle_time)
         except FORBIDDEN as error:
             self.forbidden = error
@@ -262,6 +268,7 @@ class PliantWorker(Worker):
                 self._keep_execution(job)
             time.sleep(POLL)
         self._horse_pid = 0
+        self.foreign_store = was_foreign(status)
         self._reap(watch, job, status=status, peak=usage.ru_maxrss * RSS_UNIT)
 
     def _keep_execution(self, job: RqJob) -> None:
