@@ -182,13 +182,14 @@ class QuotaExceeded(WorkerError):
 
     code = "quota_exceeded"
 
-    def __init__(self, *, used: int, quota: int, needed: int) -> None:
+    def __init__(self, *, used: int, quota: int, needed: int, results: int = 0) -> None:
         self.retryable = needed <= quota
+        of_them = f" (about {results:,} for the results)" if results else ""
         super().__init__(
-            f"Disk quota reached: {used:,} of {quota:,} bytes are used, and {needed:,} more are needed. "
+            f"Disk quota reached: {used:,} of {quota:,} bytes are used, and {needed:,} more are needed{of_them}. "
             "Delete jobs, wait until they expire, or raise PLIANT_DISK_QUOTA."
             if self.retryable
-            else f"Disk quota too small: {needed:,} bytes are needed, and the quota is {quota:,}. "
+            else f"Disk quota too small: {needed:,} bytes are needed{of_them}, and the quota is {quota:,}. "
             "Send fewer frames or points, or raise PLIANT_DISK_QUOTA."
         )
 

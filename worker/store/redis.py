@@ -172,7 +172,7 @@ class RedisRecords(Records):
         if taken == _FULL:
             raise TooManyQueued(max_queued)
         if taken == _NO_SPACE:
-            raise QuotaExceeded(used=self.used(), quota=max_bytes, needed=stored.bytes)
+            raise QuotaExceeded(used=self.used(), quota=max_bytes, needed=stored.bytes, results=stored.reserved)
         if taken is None:
             return stored
         try:
