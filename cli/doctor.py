@@ -387,15 +387,16 @@ def _redis(address: str) -> Finding:
     advice = (
         "Check that the server runs, and address and password in PLIANT_REDIS_URL; unset it to use the embedded one."
     )
-    from pliant.worker.errors import InvalidSetting, StoreUnavailable
+    from pliant.worker.errors import InvalidSetting, StoreForbidden, StoreUnavailable
     from pliant.worker.store.connection import check_server
     from pliant.worker.store.outage import address_of
 
     try:
-        policy = check_server(address)
+        policy = check_server(address, queue=settings_here().queue)
     except InvalidSetting as fault:
         return Finding("queue", "bad", str(fault), "Correct the address.")
     except StoreUnavailable as fault:
+        advice = fault.remedy if isinstance(fault, StoreForbidden) else advice
         return Finding("queue", "bad", f"{address_of(address)} cannot be used ({fault.reason})", advice)
     where = address_of(address)
     if policy not in ("noeviction", ""):

@@ -104,16 +104,18 @@ def film_rows(facts: FilmFacts, options: Options, estimate: Estimate | None) -> 
     from pliant.worker.films.tracker import notes_on_rate
 
     of_all = f" of {facts.stated_frames}" if facts.frames != facts.stated_frames else ""
-    assumed = (
-        ", assumed: pictures state none"
-        if notes_on_rate(facts.container) and "fps" not in options.model_fields_set
-        else ""
-    )
+    source = " by the file"
+    if "fps" not in options.model_fields_set:
+        # The times of all frames, which may be uneven, are known only once they are decoded.
+        pictures = notes_on_rate(facts.container)
+        source = (
+            ", assumed: pictures state none" if pictures else f"{source}; the result has that of its tracked frames"
+        )
     rows = [
         ("film", facts.container),
         ("size", f"{facts.width}×{facts.height} pixels"),
         ("frames", f"{facts.frames}{of_all}" if facts.frames else "not stated"),
-        ("rate", f"{facts.fps:.4g} frames per second{assumed}"),
+        ("rate", f"{facts.fps:.4g} frames per second{source}"),
         ("duration", f"{facts.seconds:.1f} s" if facts.seconds else "not stated"),
         ("rotation", f"{facts.rotation}°, applied" if facts.rotation else "none"),
     ]

@@ -74,7 +74,7 @@ def up(
     """
     require_server("pliant up")
     from pliant.service.settings import ServiceSettings
-    from pliant.worker.processes.preflight import check_settings, open_data_directory
+    from pliant.worker.processes.preflight import check_disks, check_settings, open_data_directory
     from pliant.worker.processes.supervisor import Supervisor, valkey_child, worker_children
     from pliant.worker.processes.valkey import Valkey
 
@@ -86,6 +86,7 @@ def up(
     url = address(host, port)
     make_folder(settings.data, "--data")
     open_data_directory(settings)
+    check_disks(settings)
     with ExitStack() as held:
         children: list[Child] = []
         if settings.redis_url is None:

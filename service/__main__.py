@@ -8,7 +8,6 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 
 import uvicorn
 from fastapi import FastAPI
@@ -16,11 +15,13 @@ from pliant.service.app import create_app
 from pliant.service.settings import ServiceSettings
 from pliant.worker import tracing
 from pliant.worker.environment import variable_of, warnings_of_unknown
-from pliant.worker.errors import InvalidSetting, StoreUnavailable, WorkerError
+from pliant.worker.errors import InvalidSetting, StoreForbidden, StoreUnavailable, WorkerError
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.logs import configure_logging
 from pliant.worker.processes.preflight import check_process, open_data_directory
+from pliant.worker.records import utc_now
 from pliant.worker.settings import Settings
+from pliant.worker.store.outage import described
 from pliant.worker.tokens import Tokens
 
 _log = logging.getLogger("pliant.service")
@@ -58,12 +59,16 @@ def stop_streams(app: FastAPI) -> None:
 
 
 def check_access(settings: ServiceSettings, tokens: Tokens) -> None:
-    """Refuse to start if tokens are required and none is valid, because nobody could use the service.
+    """Refuse to start if tokens are required and there is none, because nobody could use the service.
+
+    If all have expired, it starts with a warning: share links still work, and a new token needs no restart.
 
     Raises
     ------
     InvalidSetting
-        There is no valid token; the message names both remedies.
+        There is no token; the message names both remedies.
+    StoreForbidden
+        The store forbids reading the tokens.
     """
     if not settings.asks_for_tokens:
         if not settings.loopback:
@@ -72,17 +77,44 @@ def check_access(settings: ServiceSettings, tokens: Tokens) -> None:
             )
         return
     try:
-        usable = tokens.usable()
+        found = tokens.all()
+    except StoreForbidden:
+        raise
     except StoreUnavailable:
         return  # requests are answered 503 until the store is back
-    if not usable:
+    if found and all(token.expired(utc_now()) for token in found):
+        last = max(found, key=lambda token: token.expires_at or token.created_at)
+        _log.warning(
+            "every token has expired, the last one (%s, for %s) on %s: requests with them are refused. Create another with `pliant token "
+            "create NAME --sharing %s`, with the same PLIANT_DATA or PLIANT_REDIS_URL; it is valid at once.",
+            last.id, last.name, f"{last.expires_at:%Y-%m-%d %H:%M} UTC", last.id,
+        )  # fmt: skip
+    if not found:
         raise InvalidSetting(
             variable_of("auth"),
-            expected=f"a valid token for requests to {settings.host}",
+            expected=f"a token for requests to {settings.host}",
             got="none",
             hint="Create one with `pliant token create NAME`, with the same PLIANT_DATA or PLIANT_REDIS_URL, then start again; "
             "or set PLIANT_AUTH=off if a proxy controls access.",
         )
+
+
+def check_store(jobs: Jobs) -> None:
+    """Check the version of the records, if the store answers; if not, requests are answered 503 until it does.
+
+    Raises
+    ------
+    NewerData
+        The records were written by a newer version.
+    StoreForbidden
+        The store forbids a command.
+    """
+    try:
+        jobs.records.ping()
+    except StoreForbidden:
+        raise
+    except StoreUnavailable:
+        return
 
 
 def print_openapi(*, schemas_only: bool) -> None:
@@ -110,9 +142,11 @@ def main(arguments: Sequence[str] = ()) -> int:
         check_process(of_worker)
         tracing.configure(of_worker.tracing, service="pliant-api")
         jobs = Jobs.open(of_worker)
-        with suppress(StoreUnavailable):  # requests are answered 503 until the store is back
-            jobs.records.ping()
+        check_store(jobs)
         app = create_app(jobs, settings, tokens=tokens)
+    except StoreForbidden as error:
+        sys.stderr.write(f"{described(error, of_worker.redis)}\n")
+        return 2
     except WorkerError as error:
         sys.stderr.write(f"{error}\n")
         return 2

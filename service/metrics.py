@@ -97,7 +97,7 @@ class StoreCollector(Collector):
             ("pliant_queue_depth", "Jobs in the queue, next to be taken by a worker.", len(queue.waiting())),
             ("pliant_queue_oldest_seconds", "Seconds since the oldest queued job was created.", age),
             ("pliant_workers_alive", "Workers with a recent heartbeat.", len(queue.workers())),
-            ("pliant_stored_bytes", "Bytes of all jobs' inputs and results.", records.used()),
+            ("pliant_stored_bytes", "Bytes of all jobs' inputs and results, with those reserved.", records.used()),
         ):
             yield GaugeMetricFamily(name, text, value=value)
         final = [each.value for each in Status if each.final]

@@ -11,8 +11,9 @@ import sys
 from types import FrameType
 
 from pliant.worker.environment import read
-from pliant.worker.errors import StoreUnavailable, WorkerError
+from pliant.worker.errors import ForeignStore, StoreUnavailable, WorkerError
 from pliant.worker.execution.rq_worker import PliantWorker
+from pliant.worker.jobs.foreign_store import check_at_start, check_before_forking
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.logs import LogSettings, configure_logging
 from pliant.worker.maintenance.reconciler import Reconciler
@@ -44,13 +45,14 @@ def work(settings: Settings) -> int:
     The modules of a job are imported once, before the first fork. This is safe because this process does no numerical work:
     the numerical library stops its threads in the fork and restarts them in the job process.
     """
+    open_data_directory(settings)
+    check_before_forking(settings)
     for variable in NUMERICAL_THREADS:
         os.environ.setdefault(variable, "1")
     for module in PRELOADED:
         importlib.import_module(module)
     gc.collect()
     gc.freeze()  # otherwise the first garbage collection of every job process would copy all shared pages
-    open_data_directory(settings)
     quick, text = (
         connect(settings.redis, decode=decode, retries=0, answer_within=WATCH_ANSWERS_WITHIN)
         for decode in (False, True)
@@ -67,7 +69,11 @@ def work(settings: Settings) -> int:
             queue=RedisQueue(connection, name=settings.queue),
             name=secrets.token_hex(6),
         )
-    worker.work(logging_level=None)
+        worker.work(logging_level=None)
+        if worker.forbidden is not None:
+            raise worker.forbidden
+    if worker.foreign_store:
+        raise ForeignStore(settings.blobs)
     return 0
 
 
@@ -85,6 +91,7 @@ def reconcile(settings: Settings) -> int:
         open_data_directory(settings)
     jobs = Jobs.open(settings)
     jobs.records.ping()  # the supervisor repeats a start without a store
+    check_at_start(jobs)  # it would remove the files of another installation
     sender = WebhookSender.open(settings, jobs.records)
     sender.start()
     Reconciler(jobs=jobs).run(lambda: stopping or not sender.alive)  # the supervisor restarts a failed sender

@@ -182,13 +182,14 @@ class QuotaExceeded(WorkerError):
 
     code = "quota_exceeded"
 
-    def __init__(self, *, used: int, quota: int, needed: int) -> None:
+    def __init__(self, *, used: int, quota: int, needed: int, results: int = 0) -> None:
         self.retryable = needed <= quota
+        of_them = f" (about {results:,} for the results)" if results else ""
         super().__init__(
-            f"Disk quota reached: {used:,} of {quota:,} bytes are used, and {needed:,} more are needed. "
+            f"Disk quota reached: {used:,} of {quota:,} bytes are used, and {needed:,} more are needed{of_them}. "
             "Delete jobs, wait until they expire, or raise PLIANT_DISK_QUOTA."
             if self.retryable
-            else f"Disk quota too small: {needed:,} bytes are needed, and the quota is {quota:,}. "
+            else f"Disk quota too small: {needed:,} bytes are needed{of_them}, and the quota is {quota:,}. "
             "Send fewer frames or points, or raise PLIANT_DISK_QUOTA."
         )
 
@@ -206,6 +207,31 @@ class StoreUnavailable(WorkerError):
     def __init__(self, what: str, *, reason: str) -> None:
         super().__init__(f"{what} is unavailable ({reason}). No data was lost; try again in a few seconds.")
         self.what, self.reason = what, reason
+
+
+class StoreForbidden(StoreUnavailable):
+    """The access rules (ACL) of Redis forbid its user a command, a key or a channel that Pliant needs."""
+
+    remedy = "Grant it to the user in PLIANT_REDIS_URL; docs/how-to/two-hosts.md lists the access rules."
+
+    def __init__(self, forbidden: str) -> None:
+        reason = f"its access rules forbid {forbidden}"
+        super().__init__(JOB_STORE, reason=reason)
+        self.args = (
+            f"{JOB_STORE} is unavailable ({reason}). No data was lost; the operator must grant the permission.",
+        )
+
+
+class ForeignStore(InvalidSetting):
+    """The blob store has no inputs of the newest jobs: it is probably not the one of the installation."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__(
+            "PLIANT_BLOB_URL",
+            expected="the blob store in which the service keeps the files of its jobs",
+            got=f"{url!r}, which has no files of the newest jobs",
+            hint="Give every process the service's PLIANT_BLOB_URL. If it is the same, the files were lost: delete these jobs.",
+        )
 
 
 class DataDirectoryInUse(WorkerError):

@@ -72,7 +72,10 @@ class Stored(BaseModel):
     """Blob with the arrays of a stored result, for a job that writes further files from it instead of solving."""
 
     bytes: int = 0
-    """Total size of the job's files, bytes."""
+    """Total size of the job's files, bytes; of an unfinished job with what is reserved for its results."""
+
+    reserved: int = 0
+    """Bytes that are reserved for the results of an unfinished job, if there is a disk quota."""
 
     prefix: str | None = None
     """Blob prefix of the published artifacts; None until the job has succeeded."""

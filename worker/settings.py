@@ -97,8 +97,8 @@ class Settings:
     """Time for which a job that ends from now on is kept with its files; 0: indefinitely. Jobs that have ended keep their `expires_at`."""
 
     disk_quota: Bytes = 0
-    """Maximum total bytes of jobs and uploads, above which new ones are rejected; 0: no quota. Results of accepted jobs are stored beyond
-    it, too: leave room for them on the disk."""
+    """Maximum total bytes of jobs and uploads, above which new ones are rejected; 0: no quota. Space for the results of a job is reserved
+    when it is accepted, by an estimate; results that turn out larger are stored beyond the quota."""
 
     read_memory: int = Field(default=8 << 30, ge=1 << 30, description="a whole number of bytes, at least 1 GiB")
     """Limit on the address space of the process that reads large inputs; inputs that need more are rejected as too_large."""

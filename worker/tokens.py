@@ -192,11 +192,6 @@ class Tokens:
         tokens = [token for token in map(Token.model_validate_json, bodies) if not token.revoked]
         return sorted(tokens, key=lambda token: (token.created_at, token.id))
 
-    def usable(self) -> bool:
-        """Return whether at least one token has not expired."""
-        now = self._clock()
-        return any(not token.expired(now) for token in self.all())
-
     def revoke(self, id: str) -> Token:
         """Revoke a token for ever, effective from the next request on. Its jobs are kept.
 

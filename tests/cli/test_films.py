@@ -103,7 +103,7 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
     for each in (
         "size 72×96 pixels",
         "frames 5 of 10",
-        "rate 15 frames per second",
+        "rate 15 frames per second by the file; the result has that of its tracked frames",
         "rotation 90°, applied",
     ):
         assert each in words
@@ -112,6 +112,10 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
     assert abs(int(total) - int(tracking) - int(solving)) <= 1  # each is rounded
     assert "-O surface=free omits it" in words
     assert "surface=free" not in inspect(film, "-O", "surface=free").output
+    uneven = films.with_uneven_times(copied(film, tmp_path), first=3)
+    assert "by the file; the result has that of its tracked frames" in " ".join(inspect(uneven).output.split())
+    rate = r"rate +\S+ frames per second by the file\n"
+    assert re.search(rate, re.sub(" +\n", "\n", inspect(uneven, "-O", "fps=12").output)), "the option decides"
     assert read["warnings"] == []
     assert [each[:19] for each in everything["warnings"]] == ["No region was given"]
     assert "warning No region was given" in words

@@ -62,6 +62,23 @@ def test_a_folder_of_another_user_is_refused_before_processes_start(
     assert sentence in result.output
 
 
+@pytest.mark.parametrize("store", ["data", "blobs"])
+def test_a_full_disk_is_named_before_processes_start(
+    run: Run, monkeypatch: pytest.MonkeyPatch, small_disk: Path, tmp_path: Path, store: str
+) -> None:
+    small = small_disk / store
+    data, variables = (small, {}) if store == "data" else (tmp_path / "data", {"PLIANT_BLOB_URL": small.as_uri()})
+    monkeypatch.setattr(Supervisor, "run", lambda *_, **__: None)
+    assert run("up", "--port", "0", "--data", str(data), **variables).exit_code == Exit.DONE
+    with pytest.raises(OSError, match="No space left on device"):
+        (small_disk / "filler").write_bytes(b"x" * (4 << 20))
+    result = run("up", "--port", "0", "--data", str(data), **variables)
+    assert result.exit_code == Exit.UNREACHABLE
+    assert f"The disk of {small} is full: free some space, then start again." in result.output
+    (small_disk / "filler").unlink()
+    assert run("up", "--port", "0", "--data", str(data), **variables).exit_code == Exit.DONE
+
+
 @pytest.mark.parametrize("command", ["up", "work"])
 @pytest.mark.parametrize(
     ("name", "value", "expected"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -110,20 +109,6 @@ def inputs_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     make_inputs(folder / "short.npz", frames=6, points=40)
     make_long_inputs(folder / "long.npz")
     return folder / "short.npz", folder / "long.npz"
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 3 MB."""
-    disk = tmp_path / "small"
-    disk.mkdir()
-    made = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=3m", "none", str(disk)], check=False, capture_output=True
-    )
-    if made.returncode != 0:
-        pytest.skip("may not mount a small file system here")
-    yield disk
-    subprocess.run(["umount", str(disk)], check=True)
 
 
 @pytest.fixture

@@ -24,12 +24,13 @@ from typing import TYPE_CHECKING
 
 from pliant.schemas.job import Problem, Progress, Status
 from pliant.worker import tracing
-from pliant.worker.errors import Interrupted, StaleAttempt, StoreUnavailable, UnknownJob
+from pliant.worker.errors import ForeignStore, Interrupted, StaleAttempt, StoreUnavailable, UnknownJob
 from pliant.worker.execution.failures import problem_of, timed_out
 from pliant.worker.execution.monitor import RetryDeadline
 from pliant.worker.execution.progress import Reporter
 from pliant.worker.execution.workdir import OUTPUT, working_directory
 from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.foreign_store import check_blob_store
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.records import Stored, dated
 from pliant.worker.settings import Settings
@@ -277,13 +278,24 @@ def work(
     """Run the job; return its result, the problem that it failed with, or None after a stop on request.
 
     Tracebacks of unexpected errors are logged. `reconstruct` replaces `pliant.worker.execution.pipeline.reconstruct` in tests.
+
+    Raises
+    ------
+    ForeignStore
+        Neither the inputs of this job nor those of others are in the blob store.
+    StaleAttempt, UnknownJob
+        The job belongs to another attempt, or was deleted.
     """
     try:
         from pliant.solver import threads_limited
 
         file = directory / "inputs.npz"
         with _repeating(attempt, "loading", 0.0):
-            attempt.wait_for_store(lambda: attempt.jobs.blobs.fetch(stored.inputs, file))
+            try:
+                attempt.wait_for_store(lambda: attempt.jobs.blobs.fetch(stored.inputs, file))
+            except FileNotFoundError:
+                attempt.wait_for_store(lambda: check_blob_store(attempt.jobs))
+                raise
         results = directory / "artifacts"
         with threads_limited(attempt.jobs.settings.threads_per_job):
             if stored.result is not None:
@@ -296,7 +308,7 @@ def work(
         late = time.monotonic() >= attempt.deadline
         attempt.log("Stopped: the time limit was reached." if late else "Stopped on request.")
         return timed_out(attempt.jobs.settings.time_limit) if late else None
-    except (StaleAttempt, UnknownJob):
+    except (StaleAttempt, UnknownJob, ForeignStore):
         raise
     except Exception as error:  # noqa: BLE001  every failure must end the job with a problem
         return attempt.failed(error)

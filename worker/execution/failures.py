@@ -13,6 +13,9 @@ from pliant.worker.errors import StoreUnavailable, TimedOut
 UNRECORDED = os.EX_TEMPFAIL
 """Exit code of a job process that the store of records did not let record its outcome."""
 
+FOREIGN_STORE = os.EX_CONFIG
+"""Exit code of a job process that found no job's files in its blob store."""
+
 _NO_THREADS = ("can't start new thread", os.strerror(errno.EAGAIN))
 """Messages of Python and SciPy when a thread's stack does not fit into the address space."""
 
@@ -78,12 +81,19 @@ def how_it_ended(status: int) -> str:
         return f"The job process was ended by signal {_named(os.WTERMSIG(status))}."
     if was_unrecorded(status):
         return "The job store did not answer when the job ended."
+    if was_foreign(status):
+        return "The files of the job are not in the blob store of its worker, nor are those of other jobs."
     return f"The job process ended with code {os.WEXITSTATUS(status)} without recording an outcome."
 
 
 def was_unrecorded(status: int) -> bool:
     """Return True if by its wait status a job process ended because the store did not take its outcome."""
     return os.WIFEXITED(status) and os.WEXITSTATUS(status) == UNRECORDED
+
+
+def was_foreign(status: int) -> bool:
+    """Return True if by its wait status a job process ended because no job has its files in the blob store."""
+    return os.WIFEXITED(status) and os.WEXITSTATUS(status) == FOREIGN_STORE
 
 
 def _named(number: int) -> str:

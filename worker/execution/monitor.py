@@ -19,6 +19,7 @@ from pliant.worker.execution.failures import (
     out_of_memory,
     problem_of,
     timed_out,
+    was_foreign,
     was_unrecorded,
     worker_lost,
 )
@@ -175,15 +176,17 @@ def _outcome(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stor
         if watch.reason is Reason.CANCELLED:
             return lifecycle.stop(stored, attempt_id=attempt_id, now=now, retention=settings.retention)
         stopped = watch.reason is Reason.STOPPING or (watch.reason is None and watch.stopping and _was_killed(status))
+        # A worker with another blob store fails no job: it ends, and its jobs wait for a worker with the right one.
+        foreign = watch.reason is None and was_foreign(status)
         # An outage of the store is no fault of the job: it is repeated, as it is by the reconciler when the outage lasts longer.
-        if stopped or (watch.reason is None and was_unrecorded(status)):
+        if stopped or foreign or (watch.reason is None and was_unrecorded(status)):
             return lifecycle.requeue(
                 stored,
                 attempt_id=attempt_id,
                 fresh=new_attempt_id(watch.id),
                 problem=worker_lost("The worker was shut down." if stopped else how_it_ended(status)),
                 now=now,
-                max_attempts=None if stopped else settings.max_attempts,
+                max_attempts=None if stopped or foreign else settings.max_attempts,
                 retention=settings.retention,
             )
         if watch.reason is Reason.TIMED_OUT:

@@ -19,9 +19,9 @@ from typing import Any
 
 import redis
 from pliant.schemas.job import Status
-from pliant.worker.errors import StoreUnavailable, UnknownJob
+from pliant.worker.errors import ForeignStore, StoreUnavailable, UnknownJob
 from pliant.worker.execution import attempt as work
-from pliant.worker.execution.failures import UNRECORDED
+from pliant.worker.execution.failures import FOREIGN_STORE, UNRECORDED, was_foreign
 from pliant.worker.execution.monitor import RetryDeadline, Watch, finalize
 from pliant.worker.execution.workdir import clean_up
 from pliant.worker.jobs.lifecycle import ACTIVE
@@ -52,6 +52,9 @@ RSS_UNIT = 1 if sys.platform == "darwin" else 1024
 AWAY = (redis.ConnectionError, redis.TimeoutError)
 """Exceptions of an unavailable Redis."""
 
+FORBIDDEN = redis.exceptions.NoPermissionError
+"""Exception of a Redis whose access rules forbid a command. During a job it is treated like an outage; an idle worker ends with it."""
+
 LEAVE_FOR = 1.0
 """Seconds that a worker waits after requeuing a job that is too large for it, so that another worker can take the job."""
 
@@ -78,6 +81,8 @@ class Delivery(RqJob):
             logger.warning("job %s: the outcome is not recorded: %s", arguments[0], error, extra={"job": arguments[0]})
             # RQ would end with the code of any error, and the worker could not tell an outage from a crash.
             os._exit(UNRECORDED)
+        except ForeignStore:  # the worker reports it
+            os._exit(FOREIGN_STORE)
 
     @property
     def success_callback(self) -> None:
@@ -123,6 +128,10 @@ class PliantWorker(Worker):
         self._deliveries = queue
         self._stop_by: float | None = None
         self._memory = memory_for_a_job(settings)
+        self.forbidden: redis.exceptions.NoPermissionError | None = None
+        """The missing permission that the worker has ended with."""
+        self.foreign_store = False
+        """Whether the worker has ended because no job has its files in its blob store."""
 
     def subscribe(self) -> None:
         """Do not listen for commands: jobs are cancelled through their record, and forking is safer without threads."""
@@ -160,13 +169,32 @@ class PliantWorker(Worker):
         except AWAY as error:
             logger.warning("heartbeat not written: %s", error)
 
+    def dequeue_job_and_maintain_ttl(self, timeout: int | None, max_idle_time: int | None = None) -> Any:
+        """Wait for a delivery; stop if the store forbids it, since RQ would only log a traceback, or if the files are elsewhere."""
+        try:
+            if self.foreign_store:
+                raise StopRequested
+            return super().dequeue_job_and_maintain_ttl(timeout, max_idle_time)
+        except FORBIDDEN as error:
+            self.forbidden = error
+            raise StopRequested from error
+
+    def prepare_job_execution(self, job: RqJob, remove_from_intermediate_queue: bool = False) -> None:
+        """Write RQ's entry of the delivery, in the job process; if the store forbids it, end without failing the job."""
+        try:
+            super().prepare_job_execution(job, remove_from_intermediate_queue)
+        except FORBIDDEN as error:
+            id, _ = _ids_of(job)
+            logger.warning("job %s: not started: %s", id, error, extra={"job": id})
+            os._exit(UNRECORDED)
+
     def execute_job(self, job: RqJob, queue: RqQueue) -> None:
         """Run a delivery. If the store becomes unavailable before the fork, the reconciler delivers the job again."""
         try:
             if self._leave_to_a_larger(job):
                 return
             super().execute_job(job, queue)
-        except AWAY as error:
+        except (*AWAY, FORBIDDEN) as error:
             if self.horse_pid:
                 raise
             id, _ = _ids_of(job)
@@ -240,6 +268,7 @@ class PliantWorker(Worker):
                 self._keep_execution(job)
             time.sleep(POLL)
         self._horse_pid = 0
+        self.foreign_store = was_foreign(status)
         self._reap(watch, job, status=status, peak=usage.ru_maxrss * RSS_UNIT)
 
     def _keep_execution(self, job: RqJob) -> None:
@@ -247,7 +276,7 @@ class PliantWorker(Worker):
         patient, self.connection = self.connection, self._quick
         try:
             self.maintain_heartbeats(job)
-        except AWAY as error:
+        except (*AWAY, FORBIDDEN) as error:
             logger.warning("heartbeat not written: %s", error)
         finally:
             self.connection = patient

@@ -1,4 +1,4 @@
-"""Estimate a job's memory and time from its size before it runs.
+"""Estimate a job's memory, time and result files from its size before it runs.
 
 Memory is a constant for the interpreter and the libraries plus an amount per observation (F·P), since the arrays of the solver and of the
 exporters are linear in them; but where the prior is not learned, cameras are factorized from the Gram matrix of all frames. Time is a
@@ -65,7 +65,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 
-from pliant.schemas.job import Estimate
+from pliant.schemas.job import Estimate, Interpretation
 from pliant.schemas.options import Options
 from pliant.solver.limits import BLOCK_OBSERVATIONS, learned_frames
 from pliant.solver.stages import accepted_sheet, search_for_sheet
@@ -98,6 +98,28 @@ fewer take proportionally less."""
 
 MICROSECONDS = 8.0
 """Processor time per observation."""
+
+
+FILE_BYTES = {"glb": 26, "ply": 28, "obj": 46, "usd": 25, "abc": 14, "mat": 42, "mdd": 12, "csv": 7}
+"""Bytes per observation of the files of each output, measured with faces of 16 × 1,500 and 40 × 1,600 frames × points."""
+
+USUAL_FILE_BYTES = 62
+"""The same for the files that every job writes, `shapes.npz` and the preview."""
+
+FILM_POINTS = 4000
+"""Number of points of a film that is not tracked yet: the tracker chooses their distance for about as many."""
+
+
+def expected_files(interpretation: Interpretation, options: Options, *, further: bool = False) -> int:
+    """Return about how many bytes the result files will have; `further` is true if they are written from a stored result.
+
+    The number of points of a film is only known once it is tracked.
+    """
+    points = interpretation.num_points
+    if interpretation.mesh_source == "film" and points == 0:
+        points = min(FILM_POINTS, options.max_points or FILM_POINTS)
+    each = sum(FILE_BYTES[output] for output in options.outputs) + (0 if further else USUAL_FILE_BYTES)
+    return interpretation.num_frames * points * each
 
 
 def estimated(num_frames: int, num_points: int, options: Options, *, has_rotations: bool = False) -> Estimate:

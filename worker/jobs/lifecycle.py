@@ -205,7 +205,8 @@ def _check_owner(stored: Stored, attempt_id: str) -> None:
 
 def _finish(stored: Stored, status: Status, *, now: datetime, retention: float) -> Stored:
     expires = now + timedelta(seconds=retention) if retention > 0 else None
-    return _changed(stored, {"status": status, "finished_at": now, "expires_at": expires})
+    ended = {"status": status, "finished_at": now, "expires_at": expires}
+    return _changed(stored, ended, bytes=stored.bytes - stored.reserved, reserved=0)
 
 
 def _changed(stored: Stored, of_job: Mapping[str, object], **of_record: object) -> Stored:

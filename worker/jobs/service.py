@@ -11,6 +11,7 @@ from pathlib import Path
 from pliant.schemas.job import Artifact, Interpretation, Job, JobPage, Status
 from pliant.worker import tracing
 from pliant.worker.errors import NotAllowedNow, StoreUnavailable, Taken, TooManyQueued, UnknownArtifact, UnknownJob
+from pliant.worker.formats.cost import expected_files
 from pliant.worker.ids import check_id, is_id, new_attempt_id, new_job_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.admission import check_fits
@@ -319,13 +320,17 @@ class Jobs:
         `owner` defaults to the owner of these jobs.
         """
         attempt_id = new_attempt_id(job.id)
+        reserved = 0
+        if self.settings.disk_quota > 0:
+            reserved = expected_files(job.interpretation, job.options, further=from_result)
         stored = Stored(
             job=job,
             owner=owner if owner is not None else self.owner or "",
             attempt_id=attempt_id,
             inputs=(inputs := f"jobs/{job.id}/{attempt_id}/inputs.npz"),
             result=f"{folder_of(inputs)}result.npz" if from_result else None,
-            bytes=size,
+            bytes=size + reserved,
+            reserved=reserved,
             key=key_digest(submission.idempotency_key, self.owner),
             fingerprint=submission.fingerprint,
             webhook=submission.webhook,

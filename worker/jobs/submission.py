@@ -84,7 +84,7 @@ def accept(jobs: Jobs, stored: Stored, put: Callable[[str], object]) -> Stored:
     """
     quota = jobs.settings.disk_quota
     if quota > 0 and (used := jobs.records.used() + _uploaded(jobs)) + stored.bytes > quota:
-        raise QuotaExceeded(used=used, quota=quota, needed=stored.bytes)
+        raise QuotaExceeded(used=used, quota=quota, needed=stored.bytes, results=stored.reserved)
     put(stored.inputs)
     most = max(1, quota - _uploaded(jobs)) if quota > 0 else 0
     try:

@@ -7,9 +7,10 @@ from collections.abc import Callable
 
 from pliant.worker import tracing
 from pliant.worker.environment import variable_of
-from pliant.worker.errors import InvalidSetting, StoreUnavailable
+from pliant.worker.errors import InvalidSetting, ServerFailed, StoreUnavailable
 from pliant.worker.paths import make_data_directory
 from pliant.worker.processes.memory import check_workers
+from pliant.worker.processes.valkey import disk_is_full
 from pliant.worker.settings import Settings
 
 ASK_EVERY = 1.0
@@ -73,6 +74,25 @@ def open_data_directory(settings: Settings) -> None:
             got=f"{str(fault.filename or settings.data)!r} ({fault.strerror})",
             hint="Make the folder for the user that runs Pliant, or name another one.",
         ) from fault
+
+
+def check_disks(settings: Settings) -> None:
+    """Check that the disks of the data directory and of a blob store in a directory have space: without, a service does not become ready.
+
+    Raises
+    ------
+    ServerFailed
+        One of them is full.
+    """
+    folders = [settings.data]
+    if settings.blob_url is not None:
+        from pliant.worker.store.blobs import Blobs
+
+        directory = Blobs.open(settings.blob_url).directory
+        folders += [] if directory is None else [directory]
+    for folder in folders:
+        if disk_is_full(folder):
+            raise ServerFailed(f"The disk of {folder} is full: free some space, then start again.")
 
 
 def wait_for_store(settings: Settings, tell: Callable[[str], None], *, within: float | None = None) -> None:

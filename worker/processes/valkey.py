@@ -92,7 +92,8 @@ class Valkey:
             os.close(supervisor_lock)
             raise DataDirectoryInUse(str(data), holder=f"another Pliant (process {holder or 'unknown'})")
         os.truncate(supervisor_lock, 0)
-        os.pwrite(supervisor_lock, f"{os.getpid()}\n".encode(), 0)
+        with suppress(OSError):  # on a full disk, another process cannot name this one
+            os.pwrite(supervisor_lock, f"{os.getpid()}\n".encode(), 0)
         lock = os.open(home / "server.lock", os.O_RDWR | os.O_CREAT, 0o600)
         if not _lock(lock):
             _shut_down(path)
@@ -119,7 +120,8 @@ class Valkey:
         deadline = time.monotonic() + STARTS_WITHIN
         while time.monotonic() < deadline:
             if process.poll() is not None:
-                raise ServerFailed(f"The embedded Valkey ended with code {process.returncode}.", log=self.log_tail())
+                sentence = f"The embedded Valkey ended with code {process.returncode}. {self.cause()}".rstrip()
+                raise ServerFailed(sentence, log=self.log_tail())
             if _answers(socket_path(self.data)):
                 return
             time.sleep(0.02)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
 import redis
-from pliant.worker.errors import JOB_STORE, InvalidSetting, StoreUnavailable
+from pliant.worker.errors import JOB_STORE, InvalidSetting, StoreForbidden, StoreUnavailable
 from pliant.worker.store.calls import SilentServer
 from redis.backoff import ExponentialWithJitterBackoff
 from redis.client import Pipeline
@@ -85,8 +86,10 @@ def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | 
     return client
 
 
-def check_server(url: str) -> str:
-    """Check access with the password in the URL; return the server's `maxmemory-policy`, empty if it is not readable.
+def check_server(url: str, *, queue: str) -> str:
+    """Check access to the keys of an installation with the password in the URL; return the server's `maxmemory-policy`.
+
+    It is empty if it is not readable.
 
     Raises
     ------
@@ -98,7 +101,7 @@ def check_server(url: str) -> str:
     client = connect(url, decode=True, retries=0, answer_within=3.0)
     try:
         with reachable():
-            client.get("pliant:doctor")
+            client.get(f"{queue}:doctor")
             try:
                 found: dict[str, str] = client.config_get("maxmemory-policy")  # type: ignore[assignment]
             except redis.ResponseError:  # managed servers hide their configuration
@@ -141,10 +144,28 @@ def reachable() -> Iterator[None]:
         raise StoreUnavailable(JOB_STORE, reason=_reason(error)) from error
     except redis.OutOfMemoryError as error:
         raise StoreUnavailable(JOB_STORE, reason="its memory limit is reached") from error
+    except redis.exceptions.NoPermissionError as error:
+        raise StoreForbidden(_forbidden(str(error))) from error
     except redis.ResponseError as error:
+        if _IN_SCRIPT in str(error):
+            raise StoreForbidden(_forbidden(str(error))) from error
         if not str(error).startswith(("MISCONF", "LOADING", "READONLY")):
             raise
         raise StoreUnavailable(JOB_STORE, reason=str(error)[:200]) from error
+
+
+_IN_SCRIPT = "ACL failure in script"
+"""Part of the message about a command that a script may not run; older servers do not give it the code of a missing permission."""
+
+
+def _forbidden(message: str) -> str:
+    """Return what the server forbids, by its message about a missing permission; the name of the user is not repeated."""
+    command = re.search(r"'([a-z|_-]+)' (?:sub)?command", message)
+    if command is not None:
+        return f"the command {command[1].upper().replace('|', ' ')}"
+    if "channel" in message:
+        return "a channel"
+    return "a key" if "key" in message else "a command"
 
 
 def _reason(error: redis.RedisError) -> str:

@@ -41,7 +41,7 @@ class MemoryRecords(Records):
             if 0 < max_queued <= self.count([Status.QUEUED], owner=stored.owner):
                 raise TooManyQueued(max_queued)
             if 0 < max_bytes < (used := self.used()) + stored.bytes:
-                raise QuotaExceeded(used=used, quota=max_bytes, needed=stored.bytes)
+                raise QuotaExceeded(used=used, quota=max_bytes, needed=stored.bytes, results=stored.reserved)
             if stored.key is not None:
                 self._keys[stored.key] = id
             self._records[id] = stored

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
-from pliant.worker.errors import JOB_STORE, StoreUnavailable
+from pliant.worker.errors import JOB_STORE, StoreForbidden, StoreUnavailable
 
 FIRST_PAUSE, LONGEST_PAUSE = 2.0, 60.0
 """Seconds between two messages about one outage; doubled each time."""
@@ -30,7 +30,8 @@ def described(error: StoreUnavailable, redis_url: str) -> str:
     """
     if error.what != JOB_STORE:
         return str(error)
-    return f"{JOB_STORE} at {address_of(redis_url)} is unavailable ({error.reason})."
+    remedy = f" {error.remedy}" if isinstance(error, StoreForbidden) else ""
+    return f"{JOB_STORE} at {address_of(redis_url)} is unavailable ({error.reason}).{remedy}"
 
 
 @dataclass(slots=True, kw_only=True)

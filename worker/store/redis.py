@@ -14,8 +14,8 @@ Keys, all under one prefix::
     tally                 hash: counters since the installation was created
     outbox, outbox:tries  jobs with a pending webhook and when it is due; number of attempts (`store.outbox`)
 
-Each write is one Lua script and therefore atomic, also in the append-only file. Before the first use, the version of the records is
-checked (`store.schema`).
+Each write is one Lua script and therefore atomic, also in the append-only file. Before the first use, the permissions of the server's
+user (`store.permissions`) and the version of the records are checked (`store.schema`).
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ from pliant.worker.records import (
 )
 from pliant.worker.store.changes import RedisChanges
 from pliant.worker.store.connection import reachable
+from pliant.worker.store.permissions import check_permissions
 from pliant.worker.store.schema import prepare
 
 # ARGV: 1 prefix, 2 id, 3 version, 4 status, 5 attempt id, 6 owner, 7 sort key, 8 bytes, 9 key digest, 10 body, 11 event, 12 data, 13 cap,
@@ -149,9 +150,10 @@ class RedisRecords(Records):
 
     @contextmanager
     def _checked(self) -> Iterator[None]:
-        """Translate errors of the store; before the first use, check the version of the records and migrate older ones."""
+        """Translate errors of the store; before the first use, check permissions and the version of the records, and migrate older ones."""
         with reachable():
             if not self._is_current:
+                check_permissions(self._redis, self._prefix)
                 prepare(self._redis, self._prefix)
                 self._is_current = True
             yield
@@ -170,7 +172,7 @@ class RedisRecords(Records):
         if taken == _FULL:
             raise TooManyQueued(max_queued)
         if taken == _NO_SPACE:
-            raise QuotaExceeded(used=self.used(), quota=max_bytes, needed=stored.bytes)
+            raise QuotaExceeded(used=self.used(), quota=max_bytes, needed=stored.bytes, results=stored.reserved)
         if taken is None:
             return stored
         try:

@@ -20,6 +20,7 @@ from pliant.service.middleware.auth import is_public, needed
 from pliant.service.settings import ServiceSettings
 from pliant.worker.errors import InvalidSetting
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.records import utc_now
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 from pliant.worker.tokens import Scope, Tokens
@@ -314,7 +315,29 @@ def test_a_public_service_without_tokens_does_not_start(valkey_url: str, caplog:
     made, _ = tokens.create("somebody")
     process.check_access(strict, tokens)
     tokens.revoke(made.id)
+    with pytest.raises(InvalidSetting, match=r"pliant token create.*PLIANT_AUTH=off"):
+        process.check_access(strict, tokens)
     process.check_access(strict, Tokens(connect("unix:///nonexistent/x.sock", decode=True, retries=0), prefix="x"))
+
+
+def test_a_service_whose_tokens_have_all_expired_starts_and_says_so(
+    valkey_url: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A restart at night must not end what works without tokens, or make a new token wait for another restart."""
+    before = Tokens(connect(valkey_url, decode=True), prefix="all-gone", clock=lambda: utc_now() - timedelta(days=3))
+    before.create("early", expires=timedelta(days=1))
+    last, _ = before.create("ada", expires=timedelta(days=2))
+    tokens, strict = Tokens(connect(valkey_url, decode=True), prefix="all-gone"), ServiceSettings(host="0.0.0.0")
+    process.check_access(strict, tokens)
+    assert (
+        f"every token has expired, the last one ({last.id}, for ada) on {last.expires_at:%Y-%m-%d %H:%M} UTC"
+        in caplog.text
+    )
+    assert f"`pliant token create NAME --sharing {last.id}`" in caplog.text
+    caplog.clear()
+    tokens.create("next", sharing=last.id)
+    process.check_access(strict, tokens)
+    assert caplog.text == ""
 
 
 @pytest.mark.parametrize(

@@ -81,8 +81,12 @@ class Prometheus:
         assert isinstance(node, promql.BinaryExpr), f"not evaluated: {type(node).__name__}"
         left, right = self._value(node.lhs), self._value(node.rhs)
         if str(node.op) == "and":
-            assert str(node.modifier).strip() == "on ()", f"not evaluated: and {node.modifier}"
-            return left if right else {}
+            form = re.fullmatch(r"on \((\w*)\)", str(node.modifier).strip())
+            assert form is not None, f"not evaluated: and {node.modifier}"
+            assert isinstance(left, dict)
+            assert isinstance(right, dict)
+            matched = {dict(labels).get(form[1]) for labels in right}
+            return {labels: value for labels, value in left.items() if dict(labels).get(form[1]) in matched}
         return binary(str(node.op), left, right)
 
     def _aggregate(self, node: Any) -> Vector:

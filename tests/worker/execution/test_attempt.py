@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import subprocess
 import sys
@@ -297,19 +296,19 @@ def test_a_scratch_folder_that_cannot_be_made_fails_the_job_with_its_cause(
     assert "NotADirectoryError" in jobs.log(id)
 
 
-def test_a_worker_with_another_blob_store_names_the_setting(
+def test_a_job_whose_file_was_lost_names_the_setting(
     jobs: Jobs,
     inputs_file: Path,
     interpretation: Interpretation,
-    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """It failed every job as a defect of Pliant."""
+    """Those of another job are there, so the worker has the right blob store."""
     caplog.set_level("INFO")
-    elsewhere = dataclasses.replace(jobs, blobs=Blobs.open((tmp_path / "elsewhere").as_uri()))
-    monkeypatch.setattr(Jobs, "open", lambda _: elsewhere)
+    monkeypatch.setattr(Jobs, "open", lambda _: jobs)
+    jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)
     id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)[0].id
+    jobs.blobs.delete(jobs.records.get(id).inputs)
     run(id, jobs.records.get(id).attempt_id, settings=jobs.settings, worker="w")
     job = jobs.get(id)
     assert job.error is not None

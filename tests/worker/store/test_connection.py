@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import pickle
 import ssl
 
 import pytest
 import redis
-from pliant.worker.errors import InvalidSetting, StoreUnavailable
+from pliant.worker.errors import InvalidSetting, StoreForbidden, StoreUnavailable
 from pliant.worker.store.connection import check_server, connect, reachable
 
 
@@ -25,6 +26,26 @@ from pliant.worker.store.connection import check_server, connect, reachable
 def test_a_server_that_cannot_serve_is_unavailable(fault: redis.RedisError, reason: str) -> None:
     with pytest.raises(StoreUnavailable, match=reason), reachable():
         raise fault
+
+
+@pytest.mark.parametrize(
+    ("fault", "forbidden"),
+    [
+        (redis.exceptions.NoPermissionError("User p has no permissions to run the 'get' command"), "the command GET"),
+        (redis.exceptions.NoPermissionError("User p has no permissions to run the 'script|load' command"), "the command SCRIPT LOAD"),
+        (redis.exceptions.NoPermissionError("No permissions to access a key"), "a key"),
+        (redis.exceptions.NoPermissionError("No permissions to access a channel"), "a channel"),
+        (redis.exceptions.NoPermissionError("in other words"), "a command"),
+        (redis.ResponseError("ACL failure in script: User p has no permissions to run the 'hset' command"), "the command HSET"),
+    ],
+)  # fmt: skip
+def test_a_missing_permission_is_named(fault: redis.RedisError, forbidden: str) -> None:
+    with pytest.raises(StoreForbidden) as caught, reachable():
+        raise fault
+    assert str(caught.value) == (
+        f"The job store is unavailable (its access rules forbid {forbidden}). No data was lost; the operator must grant the permission."
+    )
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
 
 
 def test_the_reason_is_that_of_the_system_without_the_address() -> None:
@@ -54,7 +75,7 @@ def test_command_errors_pass_through_unchanged() -> None:
     ],
 )
 def test_a_malformed_url_is_an_invalid_setting_and_not_shown(url: str) -> None:
-    for opened in (lambda: connect(url, decode=True), lambda: check_server(url)):
+    for opened in (lambda: connect(url, decode=True), lambda: check_server(url, queue="pliant")):
         with pytest.raises(InvalidSetting, match=r"^PLIANT_REDIS_URL: expected a URL redis://") as caught:
             opened()
         assert "pass" not in str(caught.value).replace("password", "")

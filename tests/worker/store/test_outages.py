@@ -15,10 +15,10 @@ from pathlib import Path
 
 import pytest
 from pliant.schemas.job import Status
-from pliant.worker.errors import StoreUnavailable
+from pliant.worker.errors import ServerFailed, StoreUnavailable
 from pliant.worker.jobs.retry import retry
 from pliant.worker.maintenance.fsck import findings
-from pliant.worker.processes.valkey import disk_is_full, find_binary
+from pliant.worker.processes.valkey import Valkey, disk_is_full, find_binary
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.store.connection import connect
@@ -224,3 +224,17 @@ def test_valkey_on_a_full_disk_refuses_jobs_and_loses_none(
         # There is no reconciler here: it would queue what is not queued, and sweep a refused submission's file hours later.
         left = findings(house.jobs, pause=0)
         assert all("belongs to no job" in each or "the queue does not hold it" in each for each in left)
+
+
+def test_a_server_that_a_full_disk_keeps_from_starting_says_so(small_disk: Path) -> None:
+    Valkey.claim(small_disk).release()
+    with pytest.raises(OSError, match="No space left on device"):
+        (small_disk / "filler").write_bytes(b"x" * (4 << 20))
+    valkey = Valkey.claim(small_disk)
+    try:
+        with pytest.raises(
+            ServerFailed, match=f"ended with code 1. The disk of {small_disk} is full: free some space."
+        ):
+            valkey.start()
+    finally:
+        valkey.release()
