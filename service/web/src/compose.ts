@@ -2,7 +2,8 @@
 
 import { type Example, Refusal, exampleFile, getOptions, isAbort, listExamples, newKey, submit } from "./api";
 import { button, h } from "./dom";
-import { OptionsForm, chosen, drawn, nameOf } from "./options";
+import { keepOptions, keptOptions } from "./draft";
+import { OptionsForm, chosen, drawn, nameOf, statedBy } from "./options";
 import { refusalBox } from "./refusal";
 import { remember, rememberSame } from "./sent";
 import { PLACES, Slots } from "./slots";
@@ -20,7 +21,10 @@ export class Compose {
   private readonly inspection = new Inspection(
     () => this.form(),
     (refusal) => (refusal ? this.refuse(refusal, "Not read", () => undefined) : this.clear()),
-    (seen) => void this.slots.seen(seen),
+    (seen) => {
+      this.options.state(statedBy(seen));
+      void this.slots.seen(seen);
+    },
   );
   private readonly label = h("input", { type: "text", id: "job-name", maxlength: 200, autocomplete: "off" });
   private readonly send = h("button", { type: "submit", class: "primary" }, "Reconstruct");
@@ -34,6 +38,8 @@ export class Compose {
   /** The job whose inputs are reused; null: the files in the form. */
   private kept: Job | null = null;
   private readonly keeping = h("div", { class: "keeping", hidden: true });
+  /** Names the options that were restored after a reload. */
+  private readonly restored = h("div", { class: "row hint", hidden: true });
   /** The automatically filled-in name; a name typed by the user is not overwritten. */
   private filledIn = "";
   /** The file or job that the filled-in name is of. */
@@ -48,6 +54,7 @@ export class Compose {
       this.examples,
       this.inspection.element,
       h("div", { class: "option" }, h("label", { for: "job-name" }, "Name (optional)"), this.label),
+      this.restored,
       this.options.element,
       h("div", { class: "send" }, this.answer, h("div", { class: "row" }, this.send, this.stop)),
     );
@@ -58,7 +65,12 @@ export class Compose {
       if (fold) fold.open = true;
     };
     form.addEventListener("invalid", unfold, true);
-    this.options.element.addEventListener("change", () => this.changed());
+    this.options.element.addEventListener("change", () => {
+      const given = this.options.values();
+      if (!this.kept) keepOptions(given);
+      if (Object.keys(given).length === 0) this.restored.hidden = true;
+      this.changed();
+    });
     this.element = h("details", { class: "card", open: true }, summary, form);
     document.addEventListener("drop", () => (this.element.open = true));
   }
@@ -68,6 +80,7 @@ export class Compose {
     const { main } = this.slots;
     if (!this.kept && main !== this.named) {
       this.named = main;
+      this.options.state(this.slots.file("film") ? statedBy(null) : {});
       const stem = main?.name.replace(/\.[^.]*$/, "").slice(0, 200) ?? "";
       if (this.label.value === this.filledIn) this.label.value = this.filledIn = stem;
     }
@@ -88,6 +101,7 @@ export class Compose {
   async load(): Promise<void> {
     const schema = await getOptions();
     this.options.load(schema);
+    this.restore();
     if (schema.properties && "region_polygon" in schema.properties) this.slots.acceptFilms();
     try {
       const { examples } = await listExamples();
@@ -97,6 +111,20 @@ export class Compose {
       if (!(error instanceof Refusal)) throw error;
       this.examples.replaceChildren(); // the examples are optional
     }
+  }
+
+  /** Fill in the options that were chosen before the page was reloaded, and say so. */
+  private restore(): void {
+    const kept = keptOptions();
+    if (Object.keys(kept).length === 0) return;
+    this.options.fill(kept);
+    const names = Object.keys(this.options.values()).map(nameOf);
+    const reset = button("Use the defaults", () => {
+      this.options.fill({});
+      this.options.focus();
+    }, { class: "link" });
+    this.restored.replaceChildren(h("span", {}, `Options from before the page was reloaded: ${names.join(", ")}.`), reset);
+    this.restored.hidden = names.length === 0;
   }
 
   private exampleButtons(examples: Example[]): (Node | string)[] {
@@ -111,6 +139,7 @@ export class Compose {
   /** Fill the form with the options of a job, to run its inputs again with different ones. */
   again(job: Job): void {
     this.keep(job);
+    this.options.state(statedBy(job.interpretation));
     this.options.fill(chosen(job));
     this.named = job;
     this.label.value = this.filledIn = job.name;
@@ -121,6 +150,7 @@ export class Compose {
 
   private keep(job: Job | null): void {
     this.kept = job;
+    if (job) this.restored.hidden = true; // the options are the job's
     this.inspection.stop();
     this.clear();
     this.keeping.hidden = job === null;

@@ -269,7 +269,7 @@ export class Slots {
     if (part === "mesh") (this.grid.parentElement as HTMLElement).hidden = file !== null;
     if (part === "film") {
       this.arrange();
-      this.filming.show(file);
+      await this.filming.show(file);
     }
     if (file === null) {
       slot.input.value = "";

@@ -9,7 +9,7 @@ import cv2
 import httpx
 import numpy as np
 import pytest
-from browsing import NEEDS_CHROMIUM
+from browsing import NEEDS_CHROMIUM, heard
 from filming import (
     BLUE,
     HEIGHT,
@@ -120,6 +120,49 @@ def test_the_rate_and_size_that_a_film_states_are_not_options_of_the_next_job(
     until(lambda: filming.evaluate("window.sent !== undefined"))
     assert sent_options(filming)["frames"] == "::2"
     assert not stated.keys() & sent_options(filming).keys()
+
+
+def test_the_form_shows_the_rate_and_size_of_the_film_instead_of_the_defaults(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
+    """Until the service has read the film, they are unknown; the default rate of tracks can still be chosen for a film."""
+    asked: list[Route] = []
+    filming.route("**/v1/inspect", lambda route: asked.append(route))
+    filming.locator(".folds summary", has_text="Files to write").click()
+    filming.locator(".folds summary", has_text="Lens").click()
+    rate, size = filming.get_by_label("Frame rate"), filming.get_by_label("Picture size")
+    expect(rate).to_have_value("25")
+    drop(filming, {"film.webm": films["film.webm"]})
+    expect(rate).to_have_attribute("placeholder", "the film's")
+    expect(rate).to_have_value("")
+    heard(filming, lambda: asked != [])
+    stated = {"fps": 30000 / 1001, "image_size": "320x240"}
+    seen = {**film_record(url, finished)["interpretation"], **stated, "sample": []}
+    asked[0].fulfill(json=seen)
+    expect(rate).to_have_attribute("placeholder", "29.97, the film's")
+    expect(size).to_have_attribute("placeholder", "320x240, the film's")
+    filming.get_by_role("button", name="Remove film").click()
+    expect(rate).to_have_value("25")
+    expect(size).to_have_attribute("placeholder", "automatic")
+
+    filming.route("**/v1/inspect", lambda route: route.fulfill(json=seen))
+    record = film_record(url, finished)
+    record["options"] |= {**stated, "fps": 25.0}
+    record["interpretation"] |= stated
+    answer_with(filming, record)
+    drop(filming, {"film.webm": films["film.webm"]})
+    expect(rate).to_have_attribute("placeholder", "29.97, the film's")
+    expect(filming.get_by_text("(1 changed)")).to_be_hidden()
+    rate.fill("25")
+    rate.press("Tab")
+    expect(filming.get_by_text("(1 changed)")).to_be_visible()
+    filming.get_by_role("button", name="Reconstruct").click()
+    expect(filming.get_by_role("region", name="Use from code")).to_contain_text('"fps": 25}')
+    assert sent_options(filming) == {"fps": 25}
+    filming.get_by_text("New reconstruction").click()
+    drop(filming, {"tracks.npz": packed(tracks=np.zeros((3, 4, 2)))})
+    expect(rate).to_have_value("25")
+    expect(filming.get_by_text("(1 changed)")).to_be_hidden()
 
 
 def test_a_film_that_the_browser_cannot_show_is_sent_without_a_region(
