@@ -69,11 +69,12 @@ def inspect_film(film: Path, *, region: Path | None, options: dict[str, Any], as
     from pliant.cli.show import dump_interpretation, print_json
     from pliant.client.multipart import checked_options
     from pliant.worker.films.sources import FilmSource
-    from pliant.worker.films.tracker import read_film
+    from pliant.worker.films.tracker import read_film, with_estimate
     from pliant.worker.settings import usable_cores
 
     checked = checked_options(options)
-    read = read_film(FilmSource(film, region), checked, estimate=True, threads=usable_cores())
+    source = FilmSource(film, region)
+    read = with_estimate(read_film(source, checked), source, threads=usable_cores())
     facts, warnings = read.facts, warnings_of_check(read.facts, region, checked)
     if as_json:
         film_itself = facts.model_dump(mode="json", exclude={"first_frame"})

@@ -85,6 +85,7 @@ export class Compose {
       if (this.label.value === this.filledIn) this.label.value = this.filledIn = stem;
     }
     this.offerExamples();
+    this.guard();
     if (!this.sending) this.inspection.changed();
   }
 
@@ -244,7 +245,10 @@ export class Compose {
       this.unsure = null;
       this.answer.replaceChildren();
       if (this.kept) rememberSame(job.id, this.kept.id);
-      else remember(job.id, files);
+      else {
+        remember(job.id, files);
+        this.slots.saved();
+      }
       this.onJob(job);
     } catch (error) {
       const unknown = isAbort(error) ? sent : error instanceof Refusal && error.problem.retryable;
@@ -279,14 +283,18 @@ export class Compose {
     return form;
   }
 
-  /** Ask before the page is left: leaving it ends the upload. */
   private readonly stay = (event: BeforeUnloadEvent): void => event.preventDefault();
+
+  /** Ask before the page is left while that ends an upload or loses a recording. */
+  private guard(): void {
+    if (this.sending || this.slots.isUnsaved) addEventListener("beforeunload", this.stay);
+    else removeEventListener("beforeunload", this.stay);
+  }
 
   private busy(busy: boolean): void {
     this.send.disabled = busy;
     this.stop.hidden = !busy;
-    if (busy) addEventListener("beforeunload", this.stay);
-    else removeEventListener("beforeunload", this.stay);
+    this.guard();
   }
 
   /** Show an error; `outcome` is what has become of the files, and `again` is called when the user has chosen one of several interpretations. */

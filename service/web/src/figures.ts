@@ -1,7 +1,7 @@
 // The key figures of a job.
 
 import { fill, h } from "./dom";
-import { type Job, isFinal } from "./types";
+import { type Job, isFinal, ofFilm } from "./types";
 import { duration, inTracksUnit, ofSize } from "./words";
 
 const whole = new Intl.NumberFormat("en");
@@ -24,7 +24,9 @@ function figures(job: Job): [string, string][] {
   if (error !== undefined) rows.push(["3-D error", `${ofSize(error)}, measured against the ground truth`]);
   if (residual !== undefined) rows.push(["Reprojection", inTracksUnit(residual, job)]);
   if (job.started_at && job.finished_at) rows.push(["Duration", duration((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)]);
-  const { progress } = job;
+  const { progress, interpretation: { estimate } } = job;
+  // That of a film is of the reconstruction only, and known when its tracking ends.
+  if (estimate && !isFinal(job.status) && !ofFilm(job)) rows.push(["Expected time", `about ${duration(Math.ceil(estimate.seconds))}`]);
   if (progress && !isFinal(job.status)) {
     if (progress.residual !== null) rows.push(["Residual", inTracksUnit(progress.residual, job)]);
     rows.push(["Time left", progress.seconds_left === null ? "–" : duration(progress.seconds_left)]);

@@ -35,6 +35,8 @@ export class Slots {
   hasFilms = false;
   /** Ends when all given files are read and in their slots. */
   read: Promise<void> = Promise.resolve();
+  /** The last recording of the camera, which exists in this page only; null once it was submitted. */
+  private recorded: File | null = null;
   private readonly slots = new Map<Part, Slot>();
   private readonly filming = new Filming(() => this.onChange());
   private readonly title = h("p", { class: "zone-title" }, "Drop tracks and a mesh here");
@@ -75,6 +77,16 @@ export class Slots {
 
   file(part: Part): File | null {
     return this.slots.get(part)?.file ?? null;
+  }
+
+  /** Whether the film is a recording that would be lost with the page. */
+  get isUnsaved(): boolean {
+    return this.recorded !== null && this.file("film") === this.recorded;
+  }
+
+  /** The service has the files. */
+  saved(): void {
+    this.recorded = null;
   }
 
   /** The file after which the job is named. */
@@ -226,7 +238,10 @@ export class Slots {
 
   private recording(): HTMLElement | string {
     if (!canRecord()) return "";
-    const film = (recorded: File): void => void this.inTurn(() => this.put("film", recorded));
+    const film = (recorded: File): void => {
+      this.recorded = recorded;
+      void this.inTurn(() => this.put("film", recorded));
+    };
     return h("span", { class: "record" }, button("Record with the camera", () => void new CameraDialog(film).open(), { class: "link" }));
   }
 

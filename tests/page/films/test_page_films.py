@@ -355,3 +355,36 @@ def test_tracks_of_a_film_are_not_taken_for_a_film(filming: Page, url: str, fini
     expect(filming.get_by_role("region", name="Use from code")).to_contain_text('submit(\n    "tracks.npz"')
     expect(filming.get_by_role("button", name="Cancel")).to_be_visible()
     expect(filming.get_by_text("The points appear as soon as they are tracked.")).to_be_hidden()
+
+
+def test_the_expected_time_of_a_film_and_of_its_job_is_shown(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
+    """In the check of the files; the record of a film's job has no estimate until it is tracked."""
+    estimate = {"memory_bytes": 2 * 10**8, "seconds": 20.0, "tracking_seconds": 100.0}
+    stated = {"image_size": "320x240", "has_rotations": False, "estimate": estimate}
+    seen = {**film_record(url, finished)["interpretation"], **stated, "sample": []}
+    filming.route("**/v1/inspect", lambda route: route.fulfill(json=seen))
+    drop(filming, {"film.webm": films["film.webm"]})
+    found = filming.get_by_role("region", name="How your files are interpreted")
+    sheet = "The test for a sheet such as paper can add half a minute; Surface: free omits it."
+    expect(found).to_contain_text(f"Timeabout 2 minutes once it runs. {sheet}")
+    filming.locator(".folds summary", has_text="Surface and smoothness").click()
+    filming.get_by_label("Surface", exact=True).select_option(label="free")
+    expect(found).to_contain_text("about 2 minutes once it runs")
+    expect(found).not_to_contain_text("sheet")
+
+    own = {**estimate, "tracking_seconds": None}
+    tracks = {**seen, "num_points": 300, "format": "unnamed", "mesh_source": "none", "estimate": own}
+    record = film_record(url, finished, status="queued", progress=None, place_in_queue=1)
+    record["interpretation"] = tracks
+    answer_with(filming, record)
+    filming.get_by_role("button", name="Reconstruct").click()
+    figures = filming.locator(".figures")
+    expect(figures).to_contain_text("Expected timeabout 20 s")
+    record |= {"status": "running", "progress": film_record(url, finished)["progress"]}
+    expect(figures).to_contain_text("Expected timeabout 20 sTime left30 s")
+    record["interpretation"] = {**tracks, "format": "film (webm)"}  # tracked by now: the reconstruction only
+    filming.reload()
+    expect(figures).to_contain_text("Time left")
+    expect(figures).not_to_contain_text("Expected time")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 
-from browsing import NEEDS_CHROMIUM
+from browsing import NEEDS_CHROMIUM, heard
 from filming import KEEP_SENT, answer_with, colour_at_corner, film_record, sent_options
 from paging import drop, until
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Dialog, Page, expect
 
 pytestmark = NEEDS_CHROMIUM
 
@@ -149,3 +149,36 @@ def test_a_running_job_is_in_the_list_after_a_reload(filming: Page, url: str, fi
     filming.reload()
     filming.get_by_role("link", name="a film").click()
     expect(filming.get_by_text("Tracking the film; about 30 seconds left.")).to_be_visible()
+
+
+def test_leaving_the_page_with_a_recording_that_was_not_submitted_is_asked_about(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
+    """It exists nowhere else, and cannot be chosen again."""
+    asked: list[str] = []
+
+    def stay(dialog: Dialog) -> None:
+        asked.append(dialog.type)
+        dialog.dismiss()
+
+    def record_film() -> None:
+        filming.get_by_role("button", name="Record with the camera").click()
+        dialog = filming.get_by_role("dialog", name="Record a film")
+        dialog.get_by_role("button", name="Record").click()
+        dialog.get_by_role("button", name="Stop").click()
+        filming.get_by_role("img", name="First frame of the film").wait_for()
+
+    answer_with(filming, film_record(url, finished))
+    filming.on("dialog", stay)
+    record_film()
+    filming.evaluate("setTimeout(() => location.reload())")
+    heard(filming, lambda: asked == ["beforeunload"])
+    drop(filming, {"film.webm": films["film.webm"]})  # instead of the recording
+    expect(filming.get_by_label("Name (optional)")).to_have_value("film")
+    reload(filming)
+    record_film()
+    filming.get_by_role("button", name="Reconstruct").click()
+    expect(filming.get_by_text("Tracking the film")).to_be_visible()
+    filming.goto(url)
+    filming.remove_listener("dialog", stay)
+    assert asked == ["beforeunload"]
