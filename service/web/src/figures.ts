@@ -24,12 +24,12 @@ function figures(job: Job): [string, string][] {
   if (error !== undefined) rows.push(["3-D error", `${ofSize(error)}, measured against the ground truth`]);
   if (residual !== undefined) rows.push(["Reprojection", inTracksUnit(residual, job)]);
   if (job.started_at && job.finished_at) rows.push(["Duration", duration((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)]);
+  if (isFinal(job.status)) return rows;
   const { progress, interpretation: { estimate } } = job;
-  // That of a film is of the reconstruction only, and known when its tracking ends.
-  if (estimate && !isFinal(job.status) && !ofFilm(job)) rows.push(["Expected time", `about ${duration(Math.ceil(estimate.seconds))}`]);
-  if (progress && !isFinal(job.status)) {
-    if (progress.residual !== null) rows.push(["Residual", inTracksUnit(progress.residual, job)]);
-    rows.push(["Time left", progress.seconds_left === null ? "–" : duration(progress.seconds_left)]);
-  }
+  const left = progress?.seconds_left ?? null;
+  if (progress !== null && progress.residual !== null) rows.push(["Residual", inTracksUnit(progress.residual, job)]);
+  // Until the remaining time is known. The estimate of a film is of its reconstruction only, and known when its tracking ends.
+  if (left === null && estimate && !ofFilm(job)) rows.push(["Expected time", duration(estimate.seconds)]);
+  else if (progress) rows.push(["Time left", left === null ? "–" : duration(left)]);
   return rows;
 }

@@ -141,7 +141,7 @@ export class Inspection {
     this.clear();
     const asking = new AbortController();
     this.asking = asking;
-    this.words.textContent = "Reading…";
+    this.words.textContent = "Sending and reading the files…";
     try {
       const seen = await inspect(form, asking.signal);
       if (asking.signal.aborted) return;

@@ -151,6 +151,22 @@ def test_a_running_job_is_in_the_list_after_a_reload(filming: Page, url: str, fi
     expect(filming.get_by_text("Tracking the film; about 30 seconds left.")).to_be_visible()
 
 
+def test_a_film_that_is_tracked_already_promises_no_points(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
+    record = film_record(url, finished)
+    record["progress"]["stage"] = "cameras"
+    answer_with(filming, record)
+    drop(filming, {"film.webm": films["film.webm"]})
+    filming.get_by_role("img", name="First frame of the film").wait_for()
+    filming.get_by_role("button", name="Reconstruct").click()
+    live = filming.locator(".live")
+    expect(live).to_have_text("The film is tracked.")  # below its first frame
+    filming.reload()
+    expect(filming.get_by_text("Estimating the cameras; about 30 seconds left.")).to_be_visible()
+    expect(live).to_be_hidden()
+
+
 def test_leaving_the_page_with_a_recording_that_was_not_submitted_is_asked_about(
     filming: Page, url: str, films: dict[str, bytes], finished: str
 ) -> None:
