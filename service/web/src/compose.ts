@@ -5,9 +5,9 @@ import { button, h } from "./dom";
 import { keepOptions, keptOptions } from "./draft";
 import { OptionsForm, chosen, drawn, nameOf, statedBy } from "./options";
 import { refusalBox } from "./refusal";
-import { remember, rememberSame } from "./sent";
+import { remember, rememberSame, rememberTime } from "./sent";
 import { PLACES, Slots } from "./slots";
-import { type Job, PARTS, type Part } from "./types";
+import { type Interpretation, type Job, PARTS, type Part } from "./types";
 import { Inspection } from "./understood";
 import { percent, title } from "./words";
 
@@ -22,6 +22,7 @@ export class Compose {
     () => this.form(),
     (refusal) => (refusal ? this.refuse(refusal, "Not read", () => undefined) : this.clear()),
     (seen) => {
+      this.seen = seen;
       this.options.state(statedBy(seen));
       void this.slots.seen(seen);
     },
@@ -42,6 +43,8 @@ export class Compose {
   private readonly restored = h("div", { class: "row hint", hidden: true });
   /** The automatically filled-in name; a name typed by the user is not overwritten. */
   private filledIn = "";
+  /** How the service reads the files and options in the form; null: not known yet, or not any more. */
+  private seen: Interpretation | null = null;
   /** The file or job that the filled-in name is of. */
   private named: File | Job | null = null;
 
@@ -86,6 +89,7 @@ export class Compose {
     }
     this.offerExamples();
     this.guard();
+    this.seen = null;
     if (!this.sending) this.inspection.changed();
   }
 
@@ -247,6 +251,7 @@ export class Compose {
       if (this.kept) rememberSame(job.id, this.kept.id);
       else {
         remember(job.id, files);
+        rememberTime(job.id, this.seen?.estimate ?? null);
         this.slots.saved();
       }
       this.onJob(job);

@@ -22,18 +22,33 @@ export async function mark(film: File): Promise<string | null> {
   return `${film.size}-${sum >>> 0}`;
 }
 
-/** Keep the region drawn on a film; null: none. */
-export function keepRegion(film: string, drawn: KeptRegion | null): void {
+interface Kept extends KeptRegion {
+  film: string;
+  /** The film's file name. */
+  name: string;
+}
+
+/** Keep the region drawn on a film, given what it is recognised by and its file name; null: none. */
+export function keepRegion(film: string, name: string, drawn: KeptRegion | null): void {
   if (drawn) {
     const region: Region = drawn.region.kind === "lasso" ? { kind: "lasso", corners: polygon(drawn.region) } : drawn.region; // rounded
-    sessionStorage.setItem(REGION, JSON.stringify({ film, region, frame: drawn.frame }));
+    sessionStorage.setItem(REGION, JSON.stringify({ film, name, region, frame: drawn.frame } satisfies Kept));
   } else if (keptRegion(film)) sessionStorage.removeItem(REGION);
 }
 
 /** Return the region last drawn if it was drawn on this film. */
 export function keptRegion(film: string): KeptRegion | null {
-  const kept = JSON.parse(sessionStorage.getItem(REGION) ?? "null") as (KeptRegion & { film: string }) | null;
-  return kept?.film === film ? kept : null;
+  const found = kept();
+  return found?.film === film ? found : null;
+}
+
+/** Return the name of the film whose region is kept; null: there is none. */
+export function filmOfRegion(): string | null {
+  return kept()?.name ?? null;
+}
+
+function kept(): Kept | null {
+  return JSON.parse(sessionStorage.getItem(REGION) ?? "null") as Kept | null;
 }
 
 /** Keep the options that differ from the defaults. */

@@ -1,7 +1,8 @@
 // The key figures of a job.
 
 import { fill, h } from "./dom";
-import { type Job, isFinal, ofFilm } from "./types";
+import { expectedSeconds } from "./sent";
+import { type Job, isFinal } from "./types";
 import { duration, inTracksUnit, ofSize } from "./words";
 
 const whole = new Intl.NumberFormat("en");
@@ -25,11 +26,12 @@ function figures(job: Job): [string, string][] {
   if (residual !== undefined) rows.push(["Reprojection", inTracksUnit(residual, job)]);
   if (job.started_at && job.finished_at) rows.push(["Duration", duration((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)]);
   if (isFinal(job.status)) return rows;
-  const { progress, interpretation: { estimate } } = job;
+  const { progress } = job;
+  const expected = expectedSeconds(job);
   const left = progress?.seconds_left ?? null;
   if (progress !== null && progress.residual !== null) rows.push(["Residual", inTracksUnit(progress.residual, job)]);
-  // Until the remaining time is known. The estimate of a film is of its reconstruction only, and known when its tracking ends.
-  if (left === null && estimate && !ofFilm(job)) rows.push(["Expected time", duration(estimate.seconds)]);
+  // Until the remaining time is known: two estimates may contradict each other.
+  if (left === null && expected !== null) rows.push(["Expected time", duration(expected)]);
   else if (progress) rows.push(["Time left", left === null ? "–" : duration(left)]);
   return rows;
 }

@@ -203,7 +203,7 @@ export class Filming {
   }
 
   private keep(): void {
-    if (this.mark !== null) keepRegion(this.mark, this.drawn);
+    if (this.film && this.mark !== null) keepRegion(this.mark, this.film.name, this.drawn);
   }
 
   /** Forget the region, except a picture that is still used. */

@@ -2,6 +2,7 @@
 
 import { CameraDialog, canRecord } from "./camera";
 import { button, h, say, uniqueId } from "./dom";
+import { filmOfRegion } from "./draft";
 import { keepServed, looksLikeFilm, looksLikePicture, looksLikeTracks, servedFrame } from "./film";
 import { Filming } from "./filming";
 import { type Entry, describe, isReadable, peek } from "./peek";
@@ -57,6 +58,8 @@ export class Slots {
   acceptFilms(): void {
     this.hasFilms = true;
     this.title.textContent = "Drop a film here, or tracks and a mesh";
+    const [slot, drawn] = [this.slots.get("film"), filmOfRegion()];
+    if (slot && slot.file === null && drawn !== null) slot.contents.textContent = `The region you drew on ${drawn} is kept: choose the film again to use it.`;
     this.arrange();
   }
 

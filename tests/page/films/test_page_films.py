@@ -357,14 +357,17 @@ def test_tracks_of_a_film_are_not_taken_for_a_film(filming: Page, url: str, fini
     expect(filming.get_by_text("The points appear as soon as they are tracked.")).to_be_hidden()
 
 
-def test_the_expected_time_of_a_film_and_of_its_job_is_shown(
+def test_the_expected_time_is_shown_until_the_remaining_time_is_known(
     filming: Page, url: str, films: dict[str, bytes], finished: str
 ) -> None:
-    """In the check of the files; the record of a film's job has no estimate until it is tracked."""
+    """The record of a film's job has no estimate: the page keeps that of the check of its files."""
     estimate = {"memory_bytes": 2 * 10**8, "seconds": 20.0, "tracking_seconds": 100.0}
-    stated = {"image_size": "320x240", "has_rotations": False, "estimate": estimate}
-    seen = {**film_record(url, finished)["interpretation"], **stated, "sample": []}
+    stated = {"image_size": "320x240", "has_rotations": False}
+    record = film_record(url, finished, status="queued", progress=None, place_in_queue=1)
+    record["interpretation"] |= stated
+    seen = {**record["interpretation"], "sample": [], "estimate": estimate}
     filming.route("**/v1/inspect", lambda route: route.fulfill(json=seen))
+    answer_with(filming, record)
     drop(filming, {"film.webm": films["film.webm"]})
     found = filming.get_by_role("region", name="How your files are interpreted")
     sheet = "The test for a sheet such as paper can add half a minute; Surface: free omits it."
@@ -374,21 +377,37 @@ def test_the_expected_time_of_a_film_and_of_its_job_is_shown(
     expect(found).to_contain_text("about 2 minutes once it runs")
     expect(found).not_to_contain_text("sheet")
 
-    own = {**estimate, "tracking_seconds": None}
-    tracks = {**seen, "num_points": 300, "format": "unnamed", "mesh_source": "none", "estimate": own}
-    record = film_record(url, finished, status="queued", progress=None, place_in_queue=1)
-    record["interpretation"] = tracks
-    answer_with(filming, record)
     filming.get_by_role("button", name="Reconstruct").click()
     figures = filming.locator(".figures")
-    expect(figures).to_contain_text("Expected time20 s")
+    expect(figures).to_have_text("Frames6Expected time2:00 min")
     progress = film_record(url, finished)["progress"]
     record |= {"status": "running", "progress": {**progress, "seconds_left": None}}
-    expect(filming.get_by_text("Tracking the film.")).to_be_visible()
-    expect(figures).to_contain_text("Expected time20 s")
-    record["progress"] = {**progress, "updated_at": "2100-01-01T00:00:00Z"}
-    expect(figures).to_contain_text(re.compile(r"300Time left\d\d s"))
-    record["interpretation"] = {**tracks, "format": "film (webm)"}  # tracked by now: the reconstruction only
     filming.reload()
-    expect(figures).to_contain_text("Time left")
-    expect(figures).not_to_contain_text("Expected time")
+    expect(filming.get_by_text("Tracking the film.")).to_be_visible()
+    expect(figures).to_have_text("Frames6Expected time2:00 min")
+    record["progress"] = {**progress, "updated_at": "2100-01-01T00:00:00Z"}
+    expect(figures).to_have_text(re.compile(r"Frames6Time left\d\d s"))
+
+
+def test_the_expected_time_of_tracks_is_that_of_their_record(filming: Page, url: str, finished: str) -> None:
+    """But not where a job only writes further files of a result."""
+    estimate = {"memory_bytes": 2 * 10**8, "seconds": 20.0, "tracking_seconds": None}
+    record = film_record(url, finished, status="queued", progress=None, place_in_queue=1)
+    record["interpretation"] |= {"num_points": 300, "format": "unnamed", "estimate": estimate}
+    answer_with(filming, record)
+    filming.goto(f"{url}/#job={finished}")
+    figures = filming.locator(".figures")
+    expect(figures).to_have_text("Frames6Points300Expected time20 s")
+    record["outputs_of"] = "f" * 32
+    filming.reload()
+    expect(figures).to_have_text("Frames6Points300")
+
+
+def test_the_picture_of_a_film_is_no_higher_than_the_screen(filming: Page, films: dict[str, bytes]) -> None:
+    """On a phone held sideways, the form is as wide as the screen."""
+    filming.set_viewport_size({"width": 844, "height": 390})
+    drop(filming, {"film.webm": films["film.webm"]})
+    box = filming.get_by_role("img", name="First frame of the film").bounding_box()
+    assert box is not None
+    assert 200 < box["height"] < 0.6 * 390
+    assert box["width"] / box["height"] == pytest.approx(WIDTH / HEIGHT, rel=0.02)

@@ -36,7 +36,10 @@ def test_the_region_is_restored_with_its_film_after_a_reload(
     draw_with_keys(filming, "ArrowRight", "ArrowRight")
     expect(words).to_have_text("Rectangle, 160 × 120 pixels at 83, 60.")
     reload(filming)
+    kept = filming.get_by_text("The region you drew on film.webm is kept: choose the film again to use it.")
+    expect(kept).to_be_visible()
     drop(filming, {"moving.gif": films["moving.gif"]})
+    expect(kept).to_be_hidden()
     expect(words).to_contain_text("No region")
     drop(filming, {"IMG_0042.webm": films["film.webm"]})
     expect(words).to_have_text("Rectangle, 160 × 120 pixels at 83, 60. Restored: you drew it on this film before.")
@@ -58,6 +61,7 @@ def test_a_region_that_was_removed_or_replaced_is_not_restored(filming: Page, fi
             drop(filming, {"mask.png": films["moving.gif"]})
             expect(words).to_contain_text("mask.png")
         reload(filming)
+        expect(filming.get_by_text("The region you drew on")).to_be_hidden()
         drop(filming, {"film.webm": films["film.webm"]})
         expect(words).to_contain_text("No region")
 
