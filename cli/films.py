@@ -122,8 +122,7 @@ def film_rows(facts: FilmFacts, options: Options, estimate: Estimate | None) -> 
         rows.append(
             ("pixels", f"{facts.pixel_aspect:.4g} times as wide as high; frames are stretched to the size above")
         )
-    without = f"none: no texture in the region in frame {options.region_frame}"
-    rows.append(("points", f"about {facts.points}" if facts.points else without))
+    rows.append(("points", f"about {facts.points}" if facts.points else "none"))  # a note gives the reason
     if estimate is not None:
         tracking, solving = facts.track_seconds, estimate.seconds
         parts = f"tracking {tracking:,.0f} s, reconstruction {solving:,.0f} s on one core"

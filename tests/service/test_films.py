@@ -142,6 +142,15 @@ def test_inspection_reads_a_film_without_tracking_it(running: Running, http: htt
 
 
 @forked
+def test_an_inspection_notes_a_film_without_texture(http: httpx.Client, tmp_path: Path) -> None:
+    blank = [np.full((72, 96, 3), 100 + 5 * i, np.uint8) for i in range(6)]
+    film = films.write_film(tmp_path / "blank.mp4", blank).read_bytes()
+    read = http.post("/v1/inspect", files=parts(film)).json()
+    assert read["estimate"] is None
+    assert read["notes"][-1].startswith("Frame 0 shows no texture that can be tracked.")
+
+
+@forked
 def test_a_film_whose_time_cannot_be_estimated_is_inspected(
     http: httpx.Client, film: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -232,6 +232,9 @@ def with_estimate(
         expected = estimated(facts.frames, points, read.options)
         expected = expected.model_copy(update={"tracking_seconds": round(facts.track_seconds, 1)})
         interpretation = interpretation.model_copy(update={"estimate": expected})
+    if facts.points == 0:
+        note = f"Frame {read.options.region_frame} shows no texture that can be tracked. If the whole film is like it, the job fails."
+        interpretation = interpretation.model_copy(update={"notes": [*interpretation.notes, note]})
     return ReadFilm(facts, read.options, interpretation)
 
 
