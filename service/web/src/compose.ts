@@ -122,10 +122,10 @@ export class Compose {
   private restore(): void {
     const kept = keptOptions();
     if (Object.keys(kept).length === 0) return;
-    this.options.fill(kept);
+    this.options.restore(kept);
     const names = Object.keys(this.options.values()).map(nameOf);
     const reset = button("Use the defaults", () => {
-      this.options.fill({});
+      this.options.reset();
       this.options.focus();
     }, { class: "link" });
     this.restored.replaceChildren(h("span", {}, `Options from before the page was reloaded: ${names.join(", ")}.`), reset);

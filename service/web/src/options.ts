@@ -180,6 +180,7 @@ interface Field {
 export class OptionsForm {
   readonly element = h("div", { class: "folds" });
   private fields: Field[] = [];
+  private stated: Record<string, string> = {};
 
   /** Build the form from the schema. Before that, jobs are submitted with the defaults. */
   load(schema: Schema): void {
@@ -211,6 +212,7 @@ export class OptionsForm {
 
   /** Show what the input states itself instead of the defaults, unless the user has chosen something else. */
   state(stated: Record<string, string>): void {
+    this.stated = stated;
     for (const field of this.fields.filter(({ name }) => STATED.includes(name))) {
       const isOpen = !isGiven(field);
       field.base = field.name in stated ? null : (field.schema.default ?? null);
@@ -225,6 +227,18 @@ export class OptionsForm {
     const field = this.fields.find((one) => one.name === name);
     field?.write(value);
     field?.element.dispatchEvent(new Event("change", { bubbles: true }));
+  }
+
+  /** Fill the form with options that the user chose, the default among them if a film was to have it. */
+  restore(options: Options): void {
+    for (const field of this.fields) if (STATED.includes(field.name) && field.name in options) field.base = null;
+    this.fill(options);
+  }
+
+  /** Set every option to its default, or to what the input states. */
+  reset(): void {
+    this.state(this.stated);
+    this.fill({});
   }
 
   /** Fill the form with the options of a job. */

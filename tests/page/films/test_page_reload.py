@@ -117,20 +117,46 @@ def test_options_are_restored_after_a_reload_and_can_be_reset(filming: Page, fil
     filming.get_by_label("Use every n-th point").fill("3")
     filming.get_by_label("Camera model").select_option(label="perspective")
     filming.get_by_role("checkbox", name="OBJ").check()
+    filming.get_by_label("Frame rate").fill("12")
+    filming.get_by_label("Frame rate").press("Tab")
     reload(filming)
-    expect(note).to_have_text("Options from before the page was reloaded: Files, Camera model, Use every n-th point.")
+    names = "Files, Frame rate, Camera model, Use every n-th point"
+    expect(note).to_have_text(f"Options from before the page was reloaded: {names}.")
     unfold("Frames and points", "Lens", "Files to write")
-    expect(filming.get_by_text("(1 changed)")).to_have_count(3)
+    expect(filming.get_by_text("(1 changed)")).to_have_count(2)
+    expect(filming.get_by_text("(2 changed)")).to_have_count(1)
     expect(filming.get_by_label("Use every n-th point")).to_have_value("3")
     expect(filming.get_by_role("checkbox", name="OBJ")).to_be_checked()
     filming.get_by_role("button", name="Use the defaults").click()
     expect(note).to_be_hidden()
     expect(filming.get_by_label("Use every n-th point")).to_have_value("1")
+    expect(filming.get_by_label("Frame rate")).to_have_value("25")
     expect(filming.locator(".folds summary").first).to_be_focused()
     reload(filming)
     expect(note).to_be_hidden()
     unfold("Frames and points")
     expect(filming.get_by_label("Use every n-th point")).to_have_value("1")
+
+
+def test_the_default_frame_rate_chosen_for_a_film_is_restored(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
+    seen = {**film_record(url, finished)["interpretation"], "fps": 30.0, "sample": []}
+    filming.route("**/v1/inspect", lambda route: route.fulfill(json=seen))
+    answer_with(filming, film_record(url, finished))
+    for again in (False, True):
+        drop(filming, {"film.webm": films["film.webm"]})
+        filming.locator(".folds summary", has_text="Files to write").click()
+        rate = filming.get_by_label("Frame rate")
+        expect(rate).to_have_attribute("placeholder", "30, the film's")
+        if not again:
+            rate.fill("25")
+            rate.press("Tab")
+            reload(filming)
+            expect(filming.get_by_text("Options from before the page was reloaded: Frame rate.")).to_be_visible()
+    filming.get_by_role("button", name="Reconstruct").click()
+    expect(filming.get_by_text("Tracking the film")).to_be_visible()
+    assert sent_options(filming) == {"fps": 25}
 
 
 def test_the_options_of_a_job_that_is_run_again_are_not_kept(filming: Page, url: str, finished: str) -> None:
