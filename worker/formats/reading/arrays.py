@@ -272,7 +272,7 @@ def _header_dictionary(text: bytes, field: str) -> dict[str, object]:
 
     Python's own parser of literals is not used: in Python 3.11, it fails now and then with a SystemError while several threads use it.
     """
-    no_dictionary = "a NumPy header that is not a Python dictionary"
+    no_dictionary = "a NumPy header that is not a dictionary of descr, fortran_order and shape"
     try:
         literal = text.decode("utf-8").strip()
     except UnicodeDecodeError as error:
@@ -287,7 +287,7 @@ def _header_dictionary(text: bytes, field: str) -> dict[str, object]:
         described[entry["name"]] = _value(entry)
         place = entry.end()
     if set(described) != {"descr", "fortran_order", "shape"}:
-        raise damaged(field, "a NumPy header with other entries than descr, fortran_order and shape")
+        raise damaged(field, no_dictionary)
     return described
 
 
