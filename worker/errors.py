@@ -227,7 +227,7 @@ class ForeignStore(InvalidSetting):
 
     def __init__(self, url: str) -> None:
         super().__init__(
-            "PLIANT_BLOB_URL",
+            variable="PLIANT_BLOB_URL",
             expected="the blob store in which the service keeps the files of its jobs",
             got=f"{url!r}, which has no files of the newest jobs",
             hint="Give every process the service's PLIANT_BLOB_URL. If it is the same, the files were lost: delete these jobs.",

@@ -22,6 +22,13 @@ from worker_house import House, settled
 Submit = Callable[..., Job]
 
 
+@pytest.fixture
+def jobs(jobs: Jobs) -> Jobs:
+    """Jobs of an installation with a Redis of its own."""
+    settings = dataclasses.replace(jobs.settings, redis_url=jobs.settings.redis_url or "redis://unused")
+    return dataclasses.replace(jobs, settings=settings)
+
+
 def elsewhere(jobs: Jobs, folder: Path) -> Jobs:
     return dataclasses.replace(jobs, blobs=Blobs.open((folder / "elsewhere").as_uri()))
 
@@ -38,6 +45,14 @@ def test_a_store_without_the_files_of_any_job_is_foreign(jobs: Jobs, submit: Sub
     jobs.blobs.delete(jobs.records.get(kept.id).inputs)
     with pytest.raises(ForeignStore, match="the files were lost: delete these jobs"):
         check_at_start(jobs)
+
+
+def test_files_that_were_lost_beside_the_embedded_valkey_keep_nothing_from_starting(
+    jobs: Jobs, submit: Submit, tmp_path: Path
+) -> None:
+    embedded = dataclasses.replace(jobs.settings, redis_url=None)
+    submit()
+    check_blob_store(dataclasses.replace(elsewhere(jobs, tmp_path), settings=embedded))
 
 
 def test_a_start_does_not_wait_for_stores(jobs: Jobs, submit: Submit, tmp_path: Path) -> None:
