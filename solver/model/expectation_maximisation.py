@@ -191,22 +191,15 @@ def rounds(
     With V = ΠΣΠᵀ + σ²I and K = V⁻¹(G − V)V⁻¹, every second moment of the posterior is a contraction of K: for a
     component with covariance D and image ΠD, E[xxᵀ] = D + (ΠD)ᵀ K (ΠD). Modes and walk variance are the probabilistic
     principal components (Tipping, Bishop 1999) of C relative to the random walk. `MAX_DENSE_FRAMES` selects the dense
-    or the factored form of K. EM ends with the last covariance for which V is positive definite to rounding.
+    or the factored form of K.
     """
-    factor, subspace, before = factor_of(gram), None, covariance
+    factor, subspace = factor_of(gram), None
     for number, floor in enumerate(floors):
-        try:
-            if len(projections) <= MAX_DENSE_FRAMES:
-                better = _round(covariance, factor, projections, floor, max_modes)
-            else:
-                better, subspace = _linear_round(covariance, factor, projections, floor, max_modes, subspace)
-                subspace = np.hstack(
-                    [subspace, _cosines(len(projections), GUARD_VECTORS, first=number * GUARD_VECTORS)]
-                )
-        except np.linalg.LinAlgError:
-            yield before
-            return
-        before, covariance = covariance, better
+        if len(projections) <= MAX_DENSE_FRAMES:
+            covariance = _round(covariance, factor, projections, floor, max_modes)
+        else:
+            covariance, subspace = _linear_round(covariance, factor, projections, floor, max_modes, subspace)
+            subspace = np.hstack([subspace, _cosines(len(projections), GUARD_VECTORS, first=number * GUARD_VECTORS)])
         yield covariance
 
 

@@ -232,17 +232,6 @@ def test_a_long_rigid_film_without_modes_is_learned() -> None:
         assert np.isfinite(found.nll)
 
 
-def test_em_ends_with_the_last_covariance_that_is_definite_to_rounding() -> None:
-    rng = np.random.default_rng(9)
-    projections = exponential(rng.normal(size=(10, 3)))[:, :2]
-    rows = (
-        1e3 * projections.reshape(-1, 3) @ rng.normal(size=(3, 2))
-    )  # rigid, without noise, 1,000 times as large as normalized tracks
-    found = annealed(rows @ rows.T / 2, projections, ModelOrder(ordered=False), iterations=60)
-    assert np.isfinite(found.nll)
-    assert np.linalg.eigvalsh(found.of_image(projections))[0] > 0
-
-
 def test_eigenvalues_that_do_not_converge_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     failing = SimpleNamespace(dsyevd=lambda matrix, lower: (np.ones(len(matrix)), matrix, 1))
     monkeypatch.setattr(expectation_maximisation, "lapack", failing)
