@@ -150,6 +150,10 @@ class Estimate(Record):
     seconds: float = Field(
         description="Processor seconds of the reconstruction on one core of a usual machine, without the test for an isometric surface."
     )
+    points: int | None = Field(
+        default=None,
+        description="Points of a film that would be tracked, before short-lived ones are dropped; null for tracks.",
+    )
     tracking_seconds: float | None = Field(
         default=None, description="Seconds of tracking a film before, measured on one of its frames; null for tracks."
     )

@@ -92,6 +92,7 @@ def test_the_estimate_of_a_film_is_limited_like_its_check(film: Path) -> None:
     assert estimate is not None
     assert estimate.tracking_seconds is not None
     assert estimate.tracking_seconds > 0
+    assert estimate.points == 40
     assert estimate.seconds == estimated(10, 40, read.options).seconds
     with pytest.raises(InvalidInput) as refused:
         with_estimate(read, source, FilmBounds(check_seconds=0.01), threads=1)

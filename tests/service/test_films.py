@@ -135,6 +135,7 @@ def test_inspection_reads_a_film_without_tracking_it(running: Running, http: htt
     assert base64.b64decode(answer.json()["first_frame"]).startswith(b"\xff\xd8\xff")
     part, whole = (each.json()["estimate"] for each in (answer, http.post("/v1/inspect", files=parts(film))))
     assert 1e8 < part["memory_bytes"] < whole["memory_bytes"] < 1e9, "fewer points"
+    assert 0 < part["points"] < whole["points"]
     assert 0 < part["tracking_seconds"] < 60
     assert 0 < part["seconds"] < whole["seconds"] < 60
     assert http.post("/v1/inspect", files={"tracks": tracks()}).json()["first_frame"] is None

@@ -230,7 +230,7 @@ def with_estimate(
     if facts.frames and facts.points:
         points = min(facts.points, read.options.max_points or facts.points)
         expected = estimated(facts.frames, points, read.options)
-        expected = expected.model_copy(update={"tracking_seconds": round(facts.track_seconds, 1)})
+        expected = expected.model_copy(update={"points": points, "tracking_seconds": round(facts.track_seconds, 1)})
         interpretation = interpretation.model_copy(update={"estimate": expected})
     if facts.points == 0:
         note = f"Frame {read.options.region_frame} shows no texture that can be tracked. If the whole film is like it, the job fails."

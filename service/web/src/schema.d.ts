@@ -88,6 +88,11 @@ export interface components {
              */
             seconds: number;
             /**
+             * Points
+             * @description Points of a film that would be tracked, before short-lived ones are dropped; null for tracks.
+             */
+            points: number | null;
+            /**
              * Tracking Seconds
              * @description Seconds of tracking a film before, measured on one of its frames; null for tracks.
              */

@@ -14,6 +14,8 @@ const MESHES: Record<string, string> = {
   film: "from the grid of tracked points",
 };
 
+const whole = new Intl.NumberFormat("en", { maximumSignificantDigits: 2 });
+
 /** The service's notes, except the one on a film's size and frames, which `facts` contains. */
 function notesOf(seen: Interpretation): string[] {
   return seen.notes.filter((note) => seen.num_points > 0 || !note.startsWith("A film of "));
@@ -31,7 +33,7 @@ function facts(seen: Interpretation): [string, string][] {
     ].filter(Boolean);
     return [
       ["Film", film.join(", ") || "as given"],
-      ["Points", "tracked when the job runs"],
+      ["Points", `${seen.estimate?.points ? `about ${whole.format(seen.estimate.points)}, ` : ""}tracked when the job runs`],
     ];
   }
   return [

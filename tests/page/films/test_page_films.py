@@ -361,7 +361,7 @@ def test_the_expected_time_is_shown_until_the_remaining_time_is_known(
     filming: Page, url: str, films: dict[str, bytes], finished: str
 ) -> None:
     """The record of a film's job has no estimate: the page keeps that of the check of its files."""
-    estimate = {"memory_bytes": 2 * 10**8, "seconds": 20.0, "tracking_seconds": 100.0}
+    estimate = {"memory_bytes": 2 * 10**8, "points": 2193, "seconds": 20.0, "tracking_seconds": 100.0}
     stated = {"image_size": "320x240", "has_rotations": False}
     record = film_record(url, finished, status="queued", progress=None, place_in_queue=1)
     record["interpretation"] |= stated
@@ -371,6 +371,7 @@ def test_the_expected_time_is_shown_until_the_remaining_time_is_known(
     drop(filming, {"film.webm": films["film.webm"]})
     found = filming.get_by_role("region", name="How your files are interpreted")
     sheet = "The test for a sheet such as paper can add half a minute; Surface: free omits it."
+    expect(found).to_contain_text("Pointsabout 2,200, tracked when the job runs")
     expect(found).to_contain_text(f"Timeabout 2 minutes once it runs. {sheet}")
     filming.locator(".folds summary", has_text="Surface and smoothness").click()
     filming.get_by_label("Surface", exact=True).select_option(label="free")
