@@ -69,11 +69,12 @@ def inspect_film(film: Path, *, region: Path | None, options: dict[str, Any], as
     from pliant.cli.show import dump_interpretation, print_json
     from pliant.client.multipart import checked_options
     from pliant.worker.films.sources import FilmSource
-    from pliant.worker.films.tracker import read_film
+    from pliant.worker.films.tracker import read_film, with_estimate
     from pliant.worker.settings import usable_cores
 
     checked = checked_options(options)
-    read = read_film(FilmSource(film, region), checked, estimate=True, threads=usable_cores())
+    source = FilmSource(film, region)
+    read = with_estimate(read_film(source, checked), source, threads=usable_cores())
     facts, warnings = read.facts, warnings_of_check(read.facts, region, checked)
     if as_json:
         film_itself = facts.model_dump(mode="json", exclude={"first_frame"})
@@ -123,8 +124,7 @@ def film_rows(facts: FilmFacts, options: Options, estimate: Estimate | None) -> 
         rows.append(
             ("pixels", f"{facts.pixel_aspect:.4g} times as wide as high; frames are stretched to the size above")
         )
-    without = f"none: no texture in the region in frame {options.region_frame}"
-    rows.append(("points", f"about {facts.points}" if facts.points else without))
+    rows.append(("points", f"about {facts.points}" if facts.points else "none"))  # a note gives the reason
     if estimate is not None:
         tracking, solving = facts.track_seconds, estimate.seconds
         parts = f"tracking {tracking:,.0f} s, reconstruction {solving:,.0f} s on one core"

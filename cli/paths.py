@@ -145,6 +145,7 @@ def output_file(
         The system allows no such name.
     """
     from pliant.client.errors import BadArgument
+    from pliant.schemas.validation import alternatives
 
     if path is None:
         return
@@ -164,7 +165,7 @@ def output_file(
         raise BadArgument(f"{option}: {path} is also another file of this command. Choose another name.")
     if suffixes and path.suffix.lower() not in suffixes:
         raise BadArgument(
-            f"{option}: expected a name that ends in {' or '.join(suffixes)}, got {path}. Choose another name."
+            f"{option}: expected a name that ends in {alternatives(suffixes)}, got {path}. Choose another name."
         )
 
 

@@ -188,8 +188,9 @@ def verdict_words(result: Job | Finished) -> tuple[str, str]:
 
 def describe_inputs(interpretation: Interpretation) -> list[tuple[str, str]]:
     """Return the interpretation of the inputs as pairs of label and text."""
+    expected = [] if interpretation.estimate is None else [("estimate", describe_needs(interpretation.estimate))]
     if interpretation.mesh_source == "film" and interpretation.num_points == 0:  # not tracked yet
-        return [("film", note) for note in interpretation.notes]
+        return [("film", note) for note in interpretation.notes] + expected
     given = [
         name for name, there in
         (("ground truth", interpretation.has_ground_truth), ("cameras", interpretation.has_rotations)) if there
@@ -205,14 +206,14 @@ def describe_inputs(interpretation: Interpretation) -> list[tuple[str, str]]:
         rows.append(("film", f"{interpretation.image_size.replace('x', '×')} pixels{rate}"))
     if len(given) > 0:
         rows.append(("also given", ", ".join(given)))
-    if (estimate := interpretation.estimate) is not None:
-        rows.append(("estimate", describe_needs(estimate)))
-    return rows + [("note", note) for note in interpretation.notes]
+    return rows + expected + [("note", note) for note in interpretation.notes]
 
 
 def describe_needs(estimate: Estimate) -> str:
     """Return estimated memory and time in words."""
-    return f"about {in_gigabytes(estimate)} of memory, {estimate.seconds:,.0f} s on one core"
+    tracking, solving = estimate.tracking_seconds, f"{estimate.seconds:,.0f} s on one core"
+    time = solving if tracking is None else f"tracking {tracking:,.0f} s, reconstruction {solving}"
+    return f"about {in_gigabytes(estimate)} of memory, {time}"
 
 
 def in_gigabytes(estimate: Estimate) -> str:

@@ -48,7 +48,7 @@ def track(
         float | None, typer.Option("--grid-step", help="Distance of neighbouring points in pixels.")
     ] = None,
     preview: Annotated[
-        Path | None, typer.Option("--preview", help="Picture to write: the tracks over some frames (JPEG).")
+        Path | None, typer.Option("--preview", help="Picture to write: the tracks over some frames (JPEG or PNG).")
     ] = None,
     force: Force = False,
     as_json: Json = False,
@@ -57,7 +57,7 @@ def track(
     one_numerical_thread()
     input_file(region, "--region")
     others = [film, region]
-    for path, name, suffixes in ((output, "--output", (".npz",)), (preview, "--preview", (".jpg", ".jpeg"))):
+    for path, name, suffixes in ((output, "--output", (".npz",)), (preview, "--preview", (".jpg", ".jpeg", ".png"))):
         output_file(path, name, force=force, suffixes=suffixes, others=others)
         others.append(path)
     _preview_outside(film, preview)
@@ -81,7 +81,7 @@ def track(
         tracked.save_npz(aside)
     if preview is not None:
         with write_aside(preview) as aside:
-            aside.write_bytes(tracked.contact_sheet())
+            aside.write_bytes(tracked.contact_sheet(png=preview.suffix.lower() == ".png"))
     if as_json:
         _print_json(tracked, output, preview)
         return

@@ -148,7 +148,10 @@ class Estimate(Record):
 
     memory_bytes: int = Field(description="Largest memory of the process that works on the job.")
     seconds: float = Field(
-        description="Processor seconds on one core of a usual machine, without the test for an isometric surface."
+        description="Processor seconds of the reconstruction on one core of a usual machine, without the test for an isometric surface."
+    )
+    tracking_seconds: float | None = Field(
+        default=None, description="Seconds of tracking a film before, measured on one of its frames; null for tracks."
     )
 
 
@@ -200,7 +203,7 @@ class Interpretation(Record):
     notes: list[str] = Field(default_factory=list, description="Sentences with evidence, exclusions and assumptions.")
     estimate: Estimate | None = Field(
         default=None,
-        description="Memory and time of the reconstruction; null for films that are not tracked yet, whose points are unknown.",
+        description="Memory and time; null for films that are not tracked yet, whose points are unknown: an inspection estimates them.",
     )
 
 

@@ -19,6 +19,7 @@ from pliant.service.middleware.lingering_close import LingeringClose
 from pliant.service.middleware.origin import OriginCheck
 from pliant.service.middleware.rate_limit import RateLimit
 from pliant.service.middleware.security_headers import SECURITY_HEADERS, SecurityHeaders
+from pliant.service.middleware.stopping import Stopping
 from pliant.service.middleware.tracing import Tracing
 from pliant.service.page import mount_page
 from pliant.service.routes import artifacts, events, examples, inspection, jobs, meta, outputs, shares, uploads
@@ -104,6 +105,7 @@ def middleware(settings: ServiceSettings, tokens: Tokens, metrics: Metrics, reco
         Middleware(CountRequests, metrics=metrics),
         Middleware(SecurityHeaders),
         Middleware(LingeringClose),
+        Middleware(Stopping),
         Middleware(OriginCheck, settings=settings),
     ]
     if settings.cors_origins:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -20,8 +21,8 @@ from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import Conflict, UnknownJob, UnknownUpload
 from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.sources import FilmSource, is_source, open_source, save_source
-from pliant.worker.films.tracker import TRACKING_OPTIONS, read_film
-from pliant.worker.formats import Limits, store_inputs
+from pliant.worker.films.tracker import TRACKING_OPTIONS, read_film, with_estimate
+from pliant.worker.formats import InvalidInput, Limits, store_inputs
 from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.isolated_reader import check_stored
 from pliant.worker.formats.point_names import one_line
@@ -240,11 +241,11 @@ class ReadInputs:
 
 
 def read_form(
-    form: Form, options: Options, limits: Limits, *, films: FilmBounds, target: Path, picture: bool = False
+    form: Form, options: Options, limits: Limits, *, films: FilmBounds, target: Path, threads: int = 0
 ) -> ReadInputs:
     """Read, check and interpret the files of a form, and store them in the file `target`. Blocks; call it on a thread.
 
-    A film is only opened, not tracked; with `picture`, its first frame is returned, too.
+    A film is only opened, not tracked; with the number of `threads` of a job, its first frame and its estimate are returned, too.
 
     Raises
     ------
@@ -258,7 +259,7 @@ def read_form(
         raise missing("tracks")
     kinds_for(options)  # refuses outputs that this installation cannot write
     if is_film:
-        return _read_film(form, options, films, target, picture=picture)
+        return _read_film(form, options, films, target, threads=threads)
     files: dict[str, Path | str | None] = {part: file.path for part, file in form.files.items()}
     if form.texts.get("mesh", "").strip():
         files["mesh"] = form.texts["mesh"].strip()
@@ -291,14 +292,17 @@ def _check_film_parts(form: Form) -> None:
         )
 
 
-def _read_film(form: Form, options: Options, bounds: FilmBounds, target: Path, *, picture: bool) -> ReadInputs:
+def _read_film(form: Form, options: Options, bounds: FilmBounds, target: Path, *, threads: int) -> ReadInputs:
     region = form.files.get("region")
     source = FilmSource(
         form.files["film"].path, None if region is None else region.path, film_name=form.files["film"].name or "the film",
         region_name="the region" if region is None else region.name or "the region",
         own_rate="fps" in options.model_fields_set,
     )  # fmt: skip
-    read = read_film(source, options, bounds, picture=picture)
+    read = read_film(source, options, bounds, picture=threads > 0)
+    if threads > 0:
+        with suppress(InvalidInput):  # a submission of this film is accepted: it decodes less
+            read = with_estimate(read, source, bounds, threads=threads)
     save_source(source, read.interpretation, target)
     return ReadInputs(read.interpretation, read.options, read.facts.first_frame or None)
 

@@ -22,6 +22,8 @@ MAKE_CAMERAS = "Use KnownCamera.from_arrays(rotations, scales), which validates 
 MAX_CENTRE_RADII = 100.0
 """Maximum distance, along x and along y, of a principal point from the frames' centroids, RMS radii: a view of 1° or more."""
 
+SMALL = "Choose camera scaled_orthographic: so small an object shows no perspective."
+
 SHARED_SHARE, SHARED_POINTS, SHARED_SAMPLE = 0.01, 3, (300, 1000)
 """Share of the visible positions that are the same one, and number of points with it, above which it probably marks hidden points; and the
 numbers of frames and of points in which it is looked for. Tracked points hardly ever meet exactly."""
@@ -205,7 +207,14 @@ def separate_points_warnings(tracks: Tracks) -> tuple[str, ...]:
     )
 
 
-def check_principal_point(centroids: Floats, unit: float, point: Floats, *, of_picture: bool = False) -> None:
+def is_near(centroids: Floats, unit: float, point: Floats) -> bool:
+    """Whether a point `(2,)` is within `MAX_CENTRE_RADII` of the centroids `(F, 2)` of all frames; `unit` is the RMS radius."""
+    return bool(np.abs(centroids - point).max() < MAX_CENTRE_RADII * unit)
+
+
+def check_principal_point(
+    centroids: Floats, unit: float, point: Floats, *, field: str = "options.principal_point"
+) -> None:
     """Check that a principal point is near the tracks.
 
     Parameters
@@ -216,25 +225,36 @@ def check_principal_point(centroids: Floats, unit: float, point: Floats, *, of_p
         RMS radius of the tracks.
     point : array, shape (2,)
         Principal point, in the unit of the centroids.
-    of_picture : bool
-        Whether it is the centre of `image_size`, for the error.
+    field : str
+        What it was taken from, for the error: `options.principal_point`, `options.image_size`, `cameras.principal_point`, or `tracks`,
+        whose mean it is.
 
     Raises
     ------
     InvalidInput
         More than `MAX_CENTRE_RADII` from the centroid of a frame.
     """
-    if not np.abs(centroids - point).max() < MAX_CENTRE_RADII * unit:
-        middle = centroids.mean(axis=0)
-        raise InvalidInput(
-            "principal_point_far", field="options.image_size" if of_picture else "options.principal_point",
-            expected=f"a {'centre' if of_picture else 'point'} within {MAX_CENTRE_RADII:.0f} RMS radii of the tracks, which lie around "
-            f"({middle[0]:.5g}, {middle[1]:.5g})",
-            got=f"({point[0]:.5g}, {point[1]:.5g})",
-            hint="Multiply tracks that are fractions of the picture by its size in pixels."
-            if of_picture
-            else "Give x, y in the unit and axes of the tracks.",
-        )  # fmt: skip
+    if is_near(centroids, unit, point):
+        return
+    middle = centroids.mean(axis=0)
+    if field == "tracks":
+        expected = f"centroids of the frames within {MAX_CENTRE_RADII:.0f} RMS radii of their mean, which is the principal point"
+        got = f"one {np.abs(centroids - point).max() / unit:.4g} radii from it"
+        hint = f"{SMALL} Hide frames that show only outliers."
+    else:
+        expected = (
+            f"a {'centre' if field == 'options.image_size' else 'point'} within {MAX_CENTRE_RADII:.0f} RMS radii of the tracks, "
+            f"which lie around ({middle[0]:.5g}, {middle[1]:.5g})"
+        )
+        got = f"({point[0]:.5g}, {point[1]:.5g})"
+        hint = (
+            "Give x, y in the unit and axes of the tracks."
+            if field != "options.image_size"
+            else "Multiply tracks that are fractions of the picture by its size in pixels."
+            if unit < 1
+            else SMALL
+        )
+    raise InvalidInput("principal_point_far", field=field, expected=expected, got=got, hint=hint)
 
 
 def check_focal(unit: float, settings: Settings, known: float | None = None) -> None:

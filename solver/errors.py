@@ -3,13 +3,15 @@
     SolverError                 base: catch this one
     ├── InvalidInput            invalid input, with the expected and the actual value and a hint
     │   └── InvalidSettings     a setting is out of its range, or two settings contradict each other
-    └── NotFinite               the arithmetic overflowed; no result
+    └── NotFinite               the arithmetic overflowed, or equations are singular to rounding; no result
 
 Not converging is not an error: see `pliant.solver.Outcome`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from pliant.schemas.invalid import Invalid, Picklable
@@ -24,7 +26,7 @@ class SolverError(Picklable):
 
 
 class NotFinite(SolverError):
-    """The arithmetic overflowed: the energy is infinite or NaN."""
+    """The arithmetic overflowed: the energy is infinite or NaN, or rounding errors made equations singular."""
 
     code = "not_finite"
 
@@ -38,6 +40,17 @@ class InvalidInput(Invalid, SolverError):
 
 class InvalidSettings(InvalidInput):
     """A setting is out of its range, or two settings contradict each other."""
+
+
+@contextmanager
+def singular_refused() -> Iterator[None]:
+    """Raise `NotFinite` where rounding errors made a matrix singular or indefinite, as coordinates of very different sizes do."""
+    from numpy.linalg import LinAlgError
+
+    try:
+        yield
+    except LinAlgError as error:
+        raise NotFinite(f"rounding errors made the equations singular ({error})") from error
 
 
 def wrong_input(field: str, code: str, expected: str, got: str, hint: str) -> InvalidInput:

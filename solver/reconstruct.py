@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pliant.solver.agreement import check_agreement, separate_points_warnings, shared_position_warnings
+from pliant.solver.errors import singular_refused
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import pulses_to
@@ -67,7 +68,7 @@ def solve(
     InvalidSettings
         The settings contradict the mesh, the cameras or the number of frames.
     NotFinite
-        The arithmetic overflowed.
+        The arithmetic overflowed, or rounding errors made equations singular.
     OSError
         The folder `scratch` is missing, cannot be written to, or has too little space.
     """
@@ -76,7 +77,7 @@ def solve(
     settings, why = resolved_order(tracks, settings)
     sheet = tries_isometry(cameras, settings)
     monitor = monitored(tracks, cameras, settings, on_step, should_stop, sheet=sheet)
-    with serial_blas(), pulses_to(monitor.pulse):
+    with serial_blas(), pulses_to(monitor.pulse), singular_refused():
         if settings.order == "film":
             return _with_report(_solved(tracks, mesh, cameras, settings, monitor, scratch), tracks, why)
         order = content_order(differences(tracks))

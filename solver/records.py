@@ -15,6 +15,9 @@ from pliant.solver.storage import allocated, let_go
 MIN_FRAMES = 3
 MIN_POINTS = 4
 
+MAX_SCALE_RATIO = 1e4
+"""Largest ratio of two given scales: with it, an object that fills a picture 10,000 pixels wide has the size of one pixel in another."""
+
 Array = NDArray[np.floating]
 """Numbers of either precision."""
 Floats = NDArray[np.float64]
@@ -238,8 +241,8 @@ class KnownCamera:
         Raises
         ------
         InvalidInput
-            Wrong type or shape, not finite, rows not orthonormal and right-handed to within 1e-3, or a scale or focal length that is not
-            positive.
+            Wrong type or shape, not finite, rows not orthonormal and right-handed to within 1e-3, a scale or focal length that is not
+            positive, or scales that differ by more than a factor of 10,000.
         """
         if focal is not None:
             length = numeric(focal, "cameras.focal", "Give one length in the tracks' unit.").astype(np.float64)
@@ -255,7 +258,7 @@ class KnownCamera:
             point = np.asarray(numeric(principal_point, "cameras.principal_point", "Give x and y."), dtype=np.float64)
             if point.shape != (2,) or not np.isfinite(point).all():
                 raise wrong_input(
-                    "cameras.principal_point", "not_finite", "two finite numbers", str(principal_point), "Give x and y."
+                    "cameras.principal_point", "not_finite", "two finite numbers", str(point.tolist()), "Give x and y."
                 )
             principal_point = (float(point[0]), float(point[1]))
         complete = _orthonormal(rotations)
@@ -377,6 +380,12 @@ def _positive_scales(scales: ArrayLike, frames: int) -> Floats:
         smallest = float(factors.min())
         got = "a value that is not finite" if not np.isfinite(factors).all() else f"{smallest:.3g}"
         raise wrong_input("scales", "out_of_range", "positive, finite numbers", got, hint)
+    ratio = float(factors.max() / factors.min())
+    if not ratio <= MAX_SCALE_RATIO:
+        raise wrong_input(
+            "scales", "out_of_range", f"scales that differ by at most a factor of {MAX_SCALE_RATIO:,.0f}", f"a factor of {ratio:.3g}",
+            "Give the object's size in the picture, in pixels per unit of the shapes: focal length divided by depth.",
+        )  # fmt: skip
     read_only(factors)
     return factors
 

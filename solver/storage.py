@@ -6,14 +6,13 @@ import mmap
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
+from numpy.typing import DTypeLike, NDArray
 
 
-def allocated(shape: tuple[int, ...], scratch: str | Path | None) -> Floats:
+def allocated(shape: tuple[int, ...], scratch: str | Path | None, dtype: DTypeLike = np.float64) -> NDArray[Any]:
     """Return an array of zeros in memory, or mapped to a temporary file in the folder `scratch`.
 
     The file is anonymous where the system allows it, and is deleted with the array. Its space is reserved at once, so a full disk raises an
@@ -25,17 +24,20 @@ def allocated(shape: tuple[int, ...], scratch: str | Path | None) -> Floats:
         The folder is missing, cannot be written to, or has too little space.
     """
     if scratch is None:
-        return np.zeros(shape)
-    size = int(np.prod(shape)) * np.dtype(np.float64).itemsize
+        return np.zeros(shape, dtype)
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     with tempfile.TemporaryFile(dir=scratch, prefix="pliant-") as file:
         if hasattr(os, "posix_fallocate"):
             os.posix_fallocate(file.fileno(), 0, size)
-        return np.asarray(np.memmap(file, dtype=np.float64, mode="w+", shape=shape))
+        return np.asarray(np.memmap(file, dtype=dtype, mode="w+", shape=shape))
 
 
-def let_go(*arrays: Floats | None) -> None:
-    """Release the memory of mapped arrays; their file is read when they are used again."""
+def let_go(*arrays: NDArray[Any] | None) -> None:
+    """Release the memory of mapped arrays and of views of them; their file is read when they are used again."""
     for array in arrays:
-        mapped = None if array is None else getattr(array.base, "_mmap", None)
+        owner = array
+        while isinstance(owner, np.ndarray) and not isinstance(owner, np.memmap):
+            owner = owner.base
+        mapped = getattr(owner, "_mmap", None)
         if isinstance(mapped, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
             mapped.madvise(mmap.MADV_DONTNEED)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.storage import let_go
 from pliant.tracking.decoding.film import Film
 from pliant.tracking.survey import Survey
 
@@ -113,17 +114,21 @@ def warnings_of(
     notes = []
     size = float(np.hypot(*np.ptp(tracks[template], axis=0)))
     lowest, highest = tracks[template].copy(), tracks[template].copy()
-    for points, seen in zip(tracks, visible, strict=True):  # one frame at a time, to save memory
+    shown = unsure = 0
+    for points, seen, doubt in zip(tracks, visible, variance, strict=True):  # one frame at a time, to save memory
         np.minimum(lowest, points, out=lowest, where=seen[:, None])
         np.maximum(highest, points, out=highest, where=seen[:, None])
+        shown += int(np.count_nonzero(seen))
+        unsure += int(np.count_nonzero(doubt[seen] > UNCERTAIN**2))
+        let_go(tracks, visible, variance)
     if np.median(np.linalg.norm(highest - lowest, axis=1)) < STILL_SHARE * size:
         notes.append(
             "Nothing moves in this film, so it holds no information about depth. Turn the object by 30° or more to both sides, "
             "or walk around it."
         )
-    if visible.mean() < 0.5:
+    if shown < 0.5 * visible.size:
         notes.append(
-            f"The points are visible in only {visible.mean():.0%} of the frames. Turn the object less far, keep hands out of the "
+            f"The points are visible in only {shown / visible.size:.0%} of the frames. Turn the object less far, keep hands out of the "
             "picture, or move more slowly."
         )
     left_out = 1 - visible.shape[1] / placed
@@ -132,7 +137,7 @@ def warnings_of(
             f"{left_out:.0%} of the points were left out, because they are visible in less than {least_seen:.0%} of the frames: the mesh "
             "has no surface there. Use a template_frame in which these parts look as in most of the film, or film them for longer."
         )
-    uncertain = float(np.count_nonzero(variance[visible] > UNCERTAIN**2)) / max(int(np.count_nonzero(visible)), 1)
+    uncertain = unsure / max(shown, 1)
     if uncertain >= MANY_UNCERTAIN:
         notes.append(
             f"In {uncertain:.0%} of the visible positions, the picture fits the template poorly; these points may be off by several "

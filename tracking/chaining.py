@@ -11,11 +11,15 @@ the points only through the boxes in which flow is computed, so the next frame's
 from __future__ import annotations
 
 import itertools
+import tempfile
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.storage import allocated, let_go
+from pliant.solver.tracks.frame_selection import evenly_spread
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.errors import TrackingStopped
 from pliant.tracking.flow import Bools, Floats, Grey, Match, best_of, dense_flow, match
@@ -40,6 +44,9 @@ films by at most 2 % and their recall by at most .004."""
 FLOW_MARGIN = 32
 """Pixels around the points within which flow is computed: twice the largest patch that DIS searches at its coarsest scale."""
 
+JUDGED_FRAMES = 300
+"""Maximum number of frames, evenly spread, from which the usual variance of a position is taken; bounds the memory."""
+
 Box = tuple[slice, slice]
 """Rows and columns of a frame."""
 
@@ -60,21 +67,46 @@ class Chain:
     variance: Floats
     """Variance of the positions, square pixels, shape `(F, P)`; see `Registration.refine`."""
 
-    @property
-    def confidence(self) -> Floats:
-        """Median variance of the visible positions over a position's own, at most 1; 0 where hidden, shape `(F, P)`.
+    @classmethod
+    def stored(cls, frames: int, points: int) -> Chain:
+        """Return a chain of zeros in temporary files, so that long films take no more memory than short ones."""
+        folder = tempfile.gettempdir()
+        return cls(
+            allocated((frames, points, 2), folder, np.float32), allocated((frames, points), folder, bool),
+            allocated((frames, points), folder, np.float32),
+        )  # fmt: skip
+
+    def let_go(self) -> None:
+        """Release the memory of stored arrays; their files are read when they are used again."""
+        let_go(self.points, self.visible, self.variance)
+
+    def times_seen(self) -> NDArray[np.int64]:
+        """Return the number of frames in which every point is visible, shape `(P,)`."""
+        count = np.zeros(self.visible.shape[1], np.int64)
+        for seen in self.visible:
+            count += seen
+            let_go(self.visible)
+        return count
+
+    def usual_variance(self) -> float | None:
+        """Return the median variance of the visible positions in at most `JUDGED_FRAMES` frames; None if all are exact.
 
         Positions in the template, and in frames identical to it, are exact: half of their variance or more is `ROUNDING`. If most visible
         positions are exact, as in a film whose object rests for a while, the median excludes them.
         """
-        found = self.variance[self.visible]
+        rows = evenly_spread(len(self.points), JUDGED_FRAMES)
+        found = self.variance[rows][self.visible[rows]]
         inexact = found[found > 2 * ROUNDING]
         if inexact.size == 0:
-            return self.visible.astype(np.float32)
+            return None
         usual = float(np.median(found))
-        if usual <= 2 * ROUNDING:
-            usual = float(np.median(inexact))
-        return np.where(self.visible, usual / np.maximum(self.variance, usual), 0).astype(np.float32)
+        return usual if usual > 2 * ROUNDING else float(np.median(inexact))
+
+    def confidence(self, rows: slice | NDArray[np.intp], usual: float | None) -> Floats:
+        """Return the confidence of some frames, shape `(n, P)`: the usual variance over a position's own, at most 1; 0 where hidden."""
+        if usual is None:
+            return self.visible[rows].astype(np.float32)
+        return np.where(self.visible[rows], usual / np.maximum(self.variance[rows], usual), 0).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,11 +143,7 @@ def chain(
     count = len(appearance.points)
     none = np.zeros(count, dtype=np.float32)
     first = _State(appearance.points, np.ones(count, dtype=bool), none, none)
-    result = Chain(
-        np.zeros((num_frames, count, 2), np.float32),
-        np.zeros((num_frames, count), bool),
-        np.zeros((num_frames, count), np.float32),
-    )
+    result = Chain.stored(num_frames, count)
     _store(result, template, first)
     for direction, end in ((1, num_frames), (-1, -1)):
         frames = range(template + direction, end, direction)
@@ -127,6 +155,7 @@ def chain(
             ahead = {} if following is None else _links(read, following, direction, template, recent, near, links, pool)
             found = _advance(read(t), links, recent, template, appearance, registration, pool)
             _store(result, t, found)
+            result.let_go()
             on_frame(t, found.points, found.visible)
             near = _two_frames_on(recent[t - direction], found) if found.visible.any() else first.points
             recent[t] = found

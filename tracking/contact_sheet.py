@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.storage import let_go
 
 if TYPE_CHECKING:
     from pliant.tracking.records import TrackedFilm
@@ -34,6 +35,7 @@ def view_of(tracks: NDArray[np.float32], visible: NDArray[np.bool_], size: tuple
     for points, seen in zip(tracks, visible, strict=True):  # one frame at a time, to save memory
         low = points.min(axis=0, where=seen[:, None], initial=np.inf).clip(max=low)
         high = points.max(axis=0, where=seen[:, None], initial=-np.inf).clip(min=high)
+        let_go(tracks, visible)
     whole = np.array(size)
     share = min(1.0, float(((high - low + 1) * (1 + 2 * MARGIN) / whole).max()))
     extent = np.maximum(1, np.round(share * whole)).astype(int)
@@ -41,8 +43,8 @@ def view_of(tracks: NDArray[np.float32], visible: NDArray[np.bool_], size: tuple
     return int(start[0]), int(start[1]), int(extent[0]), int(extent[1])
 
 
-def draw_contact_sheet(film: TrackedFilm) -> bytes:
-    """Draw visible points and their last steps over every thumbnail; return a JPEG.
+def draw_contact_sheet(film: TrackedFilm, *, png: bool = False) -> bytes:
+    """Draw visible points and their last steps over every thumbnail; return a JPEG or a PNG.
 
     A point's colour encodes its position in the template, so that a surface point has the same colour in all pictures.
     """
@@ -53,7 +55,9 @@ def draw_contact_sheet(film: TrackedFilm) -> bytes:
     pictures += [np.zeros_like(pictures[0])] * (-len(pictures) % columns)
     rows = [np.hstack(pictures[start : start + columns]) for start in range(0, len(pictures), columns)]
     whole = cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR)
-    return bytes(cv2.imencode(".jpg", whole, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes())
+    return bytes(
+        cv2.imencode(".png" if png else ".jpg", whole, [] if png else [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+    )
 
 
 def _draw(picture: NDArray[np.uint8], frame: int, film: TrackedFilm, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:

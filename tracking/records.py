@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import IO, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.storage import let_go
 from pliant.tracking.contact_sheet import View, draw_contact_sheet
 
 Stage = Literal["read", "locate", "track", "fit", "refine"]
@@ -137,24 +139,28 @@ class TrackedFilm:
         Keys: `tracks`, `visibility`, `confidence`, `faces`, `grid`, `uv`, `template`, `template_image`, `frame_indices`,
         `frame_times`, `fps`, `image_size` (width, height), `warnings`.
         """
-        with Path(path).open("wb") as stream:  # an open file keeps NumPy from adding a suffix
-            np.savez_compressed(
-                stream,
-                tracks=self.tracks,
-                visibility=self.visibility,
-                confidence=self.confidence,
-                faces=self.faces,
-                grid=self.grid,
-                uv=self.uv,
-                template=self.template,
-                template_image=self.template_image,
-                frame_indices=self.film.frame_indices,
-                frame_times=self.film.frame_times,
-                fps=self.film.fps,
-                image_size=np.array(self.film.size),
-                warnings=np.array(self.warnings, dtype=np.str_),
-            )
+        arrays = {
+            "tracks": self.tracks, "visibility": self.visibility, "confidence": self.confidence, "faces": self.faces,
+            "grid": self.grid, "uv": self.uv, "template": self.template, "template_image": self.template_image,
+            "frame_indices": self.film.frame_indices, "frame_times": self.film.frame_times, "fps": self.film.fps,
+            "image_size": self.film.size, "warnings": np.array(self.warnings, dtype=np.str_),
+        }  # fmt: skip
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, value in arrays.items():
+                array = np.asarray(value)
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    _write_array(member, array)
 
-    def contact_sheet(self) -> bytes:
-        """Draw the tracks over some frames, as one small JPEG picture."""
-        return draw_contact_sheet(self)
+    def contact_sheet(self, *, png: bool = False) -> bytes:
+        """Draw the tracks over some frames, as one small JPEG or PNG picture."""
+        return draw_contact_sheet(self, png=png)
+
+
+def _write_array(file: IO[bytes], array: NDArray[Any]) -> None:
+    """Write an array in NumPy's format, stored ones without their whole size in memory."""
+    np.lib.format.write_array_header_1_0(
+        file, {"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape}
+    )
+    for part in array if array.ndim > 1 else array[None]:
+        file.write(part.tobytes())
+        let_go(array)

@@ -169,10 +169,12 @@ def _track(run: Run, found: Survey, plan: Plan, step: float | None, *, whole: bo
         pool=run.pool, on_frame=reporter("refine"), should_stop=run.should_stop,
         on_part=lambda done, total: run.on_step(TrackingStep("fit", done, total)),
     )  # fmt: skip
-    kept_grid, kept = keep(seeds.grid, chained.visible.mean(axis=0) >= LEAST_SEEN)
+    seen = chained.times_seen()  # once is in the template alone, where no point moves
+    kept_grid, kept = keep(seeds.grid, (seen / length >= LEAST_SEEN) & (seen >= 2))
     if len(kept) < LEAST_POINTS:
         raise FilmError(
-            "tracks_lost", field="film", expected=f"at least {LEAST_POINTS} points that stay visible in {LEAST_SEEN:.0%} of the frames",
+            "tracks_lost", field="film",
+            expected=f"at least {LEAST_POINTS} points that stay visible in {LEAST_SEEN:.0%} of the frames, and in two or more",
             got=str(len(kept)),
             hint=FILM_SLOWLY,
         )  # fmt: skip
@@ -201,15 +203,18 @@ def _assemble(
     kept: NDArray[np.int64],
     notes: list[str],
 ) -> TrackedFilm:
-    """Convert the tracks to the film's pixels, in the chain's memory, and add pictures and warnings."""
+    """Convert the tracks to the film's pixels and variances to confidences, in the chain's arrays, and add pictures and warnings."""
     rows = slice(plan.start, plan.stop)
     width, height = run.film.size
     indices, times = found.indices[rows], found.times[rows]
-    visible, variance, confidence = chained.visible[:, kept], chained.variance[:, kept], chained.confidence[:, kept]
-    placed = chained.visible.shape[1]
-    for points in chained.points:
-        points[: len(kept)] = _in_film(points[kept], found.scale)
-    tracks = chained.points[:, : len(kept)]
+    frames, placed = chained.visible.shape
+    usual, left = chained.usual_variance(), len(kept)
+    for t in range(frames):
+        chained.points[t, :left] = _in_film(chained.points[t, kept], found.scale)
+        chained.visible[t, :left], chained.variance[t, :left] = chained.visible[t, kept], chained.variance[t, kept]
+        chained.let_go()
+    chained = Chain(chained.points[:, :left], chained.visible[:, :left], chained.variance[:, :left])
+    tracks, visible = chained.points, chained.visible
     template = plan.template - plan.start
     picked = np.unique(np.linspace(0, len(indices) - 1, THUMBNAILS).round().astype(np.int64))
     view = view_of(tracks, visible, run.film.size)
@@ -220,7 +225,11 @@ def _assemble(
         indices, times, tuple(int(found.indices[row]) for row in found.cuts),
     )  # fmt: skip
     uv = ((tracks[template] + 0.5) / np.array([width, height])).astype(np.float32)
-    warnings = (*notes, *warnings_of(tracks, visible, variance, template, placed=placed, least_seen=LEAST_SEEN))
+    warnings = (*notes, *warnings_of(tracks, visible, chained.variance, template, placed=placed, least_seen=LEAST_SEEN))
+    confidence = chained.variance
+    for t in range(frames):
+        confidence[t] = chained.confidence(slice(t, t + 1), usual)[0]
+        chained.let_go()
     return TrackedFilm(
         info, tracks, visible, confidence, grid, quads(grid), template, image, uv, thumbnails, view, picked, warnings
     )

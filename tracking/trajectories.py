@@ -14,6 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.solver import Tracks
 from pliant.solver.records import MIN_POINTS
 from pliant.solver.tracks.completion import RANKS, choose_points, coefficients_of, fit_basis, predict
@@ -23,6 +24,9 @@ from pliant.tracking.chaining import FIRST_STEPS, Chain, OnFrame, Read
 from pliant.tracking.errors import FILM_SLOWLY, FilmError, TrackingStopped
 from pliant.tracking.flow import Bools, Floats
 from pliant.tracking.registration import Registration
+
+WINDOW = 300
+"""Maximum number of frames whose paths are fitted together, besides the template; bounds the memory."""
 
 POINTS_AT_ONCE = 512
 """Points whose paths are computed together; all at once, in double precision, take six times the tracks' memory."""
@@ -35,37 +39,62 @@ OnPart = Callable[[int, int], None]
 """Called with the number of completed parts, and with the number of all, which may turn out to be fewer."""
 
 
-def move_to_expected(chained: Chain, should_stop: Callable[[], bool]) -> None:
-    """Move all points to their paths in a low-dimensional space, fitted to their positions weighted by confidence.
+def windows(frames: int, template: int) -> list[NDArray[np.intp]]:
+    """Return the frames whose paths are fitted together: parts of at most `WINDOW` frames, each with the template."""
+    return [np.union1d(part, [template]) for part in np.array_split(np.arange(frames), -(-frames // WINDOW))]
 
-    The space is fitted to a sample of the points. Its dimension is the one that best predicts held-out positions.
+
+def move_to_expected(chained: Chain, template: int, should_stop: Callable[[], bool]) -> None:
+    """Move all points, except in the template, to paths in a low-dimensional space, fitted to their positions weighted by confidence.
+
+    Every window has its own space, fitted to a sample of the points. Its dimension is the one that best predicts held-out positions. Where
+    a window shows too few points, they stay where they are.
 
     Raises
     ------
     FilmError
-        Code tracks_lost: too few points are visible in more than the template.
+        Code tracks_lost: no window shows enough points beyond the template.
     TrackingStopped
         `should_stop`, which is called after every dimension tried and before every part of the points, returned True; some points may
         have been moved.
     """
-    weight, random = chained.confidence, np.random.default_rng(0)
-    chosen = choose_points(weight, random)
-    if len(chosen) < MIN_POINTS:
+    usual, random, most = chained.usual_variance(), np.random.default_rng(0), 0
+    for rows in windows(len(chained.points), template):
+        again = int(np.count_nonzero(np.count_nonzero(chained.visible[rows], axis=0) >= 2))
+        most = max(most, again)
+        if again >= MIN_POINTS:
+            _move_in_window(chained, rows, rows != template, usual, random, should_stop)
+    if most < MIN_POINTS:
         raise FilmError(
             "tracks_lost", field="film", expected=f"at least {MIN_POINTS} points that stay visible beyond the template",
-            got=str(len(chosen)), hint=FILM_SLOWLY,
+            got=str(most), hint=FILM_SLOWLY,
         )  # fmt: skip
-    sample = normalize(Tracks.from_arrays(chained.points[:, chosen], weight[:, chosen]))
+
+
+def _move_in_window(
+    chained: Chain,
+    rows: NDArray[np.intp],
+    moving: Bools,
+    usual: float | None,
+    random: np.random.Generator,
+    should_stop: Callable[[], bool],
+) -> None:
+    """Move all points in the frames `rows (W,)` where `moving (W,)`."""
+    weight = chained.confidence(rows, usual)
+    chosen = choose_points(weight, random)
+    sample = normalize(Tracks.from_arrays(chained.points[rows[:, None], chosen], weight[:, chosen]))
     basis, spread, scale = fit_basis(sample.points, np.asarray(sample.visible), random, should_stop=should_stop)
     centre = sample.centroid[:, None]
     for start in range(0, weight.shape[1], POINTS_AT_ONCE):
         if should_stop():
             raise TrackingStopped
-        part = slice(start, start + POINTS_AT_ONCE)
-        points = (chained.points[:, part] - centre) / sample.unit
+        part = np.arange(start, min(start + POINTS_AT_ONCE, weight.shape[1]))
+        points = (chained.points[rows[:, None], part] - centre) / sample.unit
         relative = weight[:, part].astype(np.float64) / sample.full_confidence
         coefficients, _ = coefficients_of(points, relative, basis, spread, scale, sweeps=4)
-        chained.points[:, part] = predict(basis, coefficients) * sample.unit + centre
+        paths = predict(basis, coefficients) * sample.unit + centre
+        chained.points[rows[moving][:, None], part] = paths[moving]
+        chained.let_go()
 
 
 def track_again(
@@ -92,14 +121,16 @@ def track_again(
     FilmError, TrackingStopped
         See `move_to_expected`.
     """
-    done, parts = itertools.count(1), len(RANKS) + len(range(0, chained.points.shape[1], POINTS_AT_ONCE))
+    frames, count = chained.visible.shape
+    done = itertools.count(1)
+    parts = len(windows(frames, template)) * (len(RANKS) + len(range(0, count, POINTS_AT_ONCE)))
 
     def stopped_at_part() -> bool:
         if on_part is not None and not should_stop():
             on_part(next(done), parts)
         return should_stop()
 
-    move_to_expected(chained, stopped_at_part)
+    move_to_expected(chained, template, stopped_at_part)
     chained.points[template] = appearance.points
 
     def again(t: int) -> tuple[Floats, Bools, Floats]:
@@ -111,16 +142,17 @@ def track_again(
         return points, appearance.agrees(frame, points, alike), variance
 
     ahead: deque[tuple[int, Future[tuple[Floats, Bools, Floats]]]] = deque()
-    frames = (t for t in range(len(chained.points)) if t != template)
+    others = (t for t in range(frames) if t != template)
     try:
-        ahead.extend((t, pool.submit(again, t)) for t in itertools.islice(frames, FRAMES_AHEAD))
+        ahead.extend((t, pool.submit(again, t)) for t in itertools.islice(others, FRAMES_AHEAD))
         while ahead:
             if should_stop():
                 raise TrackingStopped
             t, future = ahead.popleft()
             points, visible, variance = future.result()
-            ahead.extend((t, pool.submit(again, t)) for t in itertools.islice(frames, 1))
+            ahead.extend((t, pool.submit(again, t)) for t in itertools.islice(others, 1))
             chained.points[t], chained.visible[t], chained.variance[t] = points, visible, variance
+            chained.let_go()
             on_frame(t, points, visible)
     finally:
         for _, future in ahead:

@@ -3,7 +3,8 @@
     python -m benchmarks.figures.film_pictures RESULT --film FILM [--at 0,15,29] [--side 40] [--plain] -o PICTURE
 
 RESULT is the folder of `pliant solve FILM` or `pliant demo` (`tracks.npz`, `shapes.npz`). `--plain` omits the film and its texture, for
-films that may not be shown, and draws the mesh from the front and from both sides.
+films that may not be shown, and draws the mesh from the front and from both sides. A positive `--side` looks from the right of the camera:
+near parts, such as a nose, point to the left. If they point to the right, the shape is hollow, although its picture may look like a face.
 """
 
 from __future__ import annotations

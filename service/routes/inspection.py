@@ -56,7 +56,8 @@ def interpret(form: Form, folder: Path, uploads: Uploads, core: Service) -> Insp
     whole, canonical = with_uploads(form, folder, uploads), folder / "canonical.npz"
     films = FilmBounds.of(core.jobs.settings, max_bytes=core.limits.max_bytes)
     options = parse_options(whole.texts.get("options", ""))
-    read = read_form(whole, options, core.limits, films=films, target=canonical, picture=True)
+    threads = core.jobs.settings.threads_per_job
+    read = read_form(whole, options, core.limits, films=films, target=canonical, threads=threads)
     # Inputs too large to be parsed in this process are too large to be sampled in it.
     tracked = "film" not in whole.files and canonical.stat().st_size <= LARGE
     sample = sample_of(load_inputs(canonical)) if tracked else []

@@ -74,9 +74,10 @@ def build_laplacian(
     seed : int
         Seed of the coarser levels of the preconditioner.
     """
-    if mesh is None or (len(mesh.faces) == 0 and mesh.grid is None):
+    on_grid = mesh is not None and mesh.grid is not None and kind in ("auto", "grid8")
+    if mesh is None or (len(mesh.faces) == 0 and not on_grid):
         return None
-    if mesh.grid is not None and kind in ("auto", "grid8"):
+    if mesh.grid is not None and on_grid:
         matrix, name = _grid_matrix(mesh.grid, mesh.num_points), "grid8"
     elif kind == "cotangent" and reference is not None:
         matrix, name = _mesh_matrix(mesh, _cotangent_weights(mesh, reference)), "cotangent"

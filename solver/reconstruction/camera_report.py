@@ -92,7 +92,12 @@ def improbable(view: Perspective, unit: float) -> str | None:
         return None
     best, gain = found
     other = "orthography" if best == 0 else f"a focal length of {unit / abs(best):.4g}"
-    gains = f"{other} gains {gain:.3f} in the log likelihood per point and frame" if np.isfinite(gain) else DIVERGED
+    instead = "" if view.is_perspective else ", so the cameras are orthographic"
+    gains = (
+        f"{other} gains {gain:.3f} in the log likelihood per point and frame"
+        if np.isfinite(gain)
+        else f"{DIVERGED}{instead}"
+    )
     return f"The given focal length, {unit / view.given:.4g}, is improbable: {gains}."
 
 
@@ -101,4 +106,7 @@ def unknown_centre_warning(view: Perspective, settings: Settings, known: KnownCa
     given = settings.centre is not None or (known is not None and known.principal_point is not None)
     if given or not view.is_perspective:
         return None
-    return "Perspective was found, but the picture's size is unknown, so the middle of the tracks is taken as its centre. Give image_size."
+    return (
+        "The camera has perspective, but the picture's size is unknown, so the middle of the tracks is taken as its centre. "
+        "Give image_size."
+    )

@@ -10,6 +10,7 @@ from pliant.solver.agreement import check_agreement, seen_again
 from pliant.solver.cameras import estimation
 from pliant.solver.cameras.estimation import CameraEstimate, given_cameras
 from pliant.solver.cameras.planar_ambiguity import is_planar
+from pliant.solver.errors import singular_refused
 from pliant.solver.evaluation.trust import turned
 from pliant.solver.limits import LEARNED_FRAMES, learned_stride
 from pliant.solver.model.expectation_maximisation import ModelOrder
@@ -104,13 +105,15 @@ def estimate_cameras(
         The given cameras do not match the tracks, too few observations are visible, or tracks or cameras are no valid records.
     InvalidSettings
         Settings and tracks contradict each other.
+    NotFinite
+        Rounding errors made equations singular.
     """
     settings = settings if settings is not None else Settings()
     check_agreement(tracks, None, known, settings)
     settings, _ = resolved_order(tracks, settings)
     observations = observe(tracks, known, settings)
     monitor = monitored(tracks, known, settings, on_step, should_stop, only=STAGES)
-    with serial_blas(), pulses_to(monitor.pulse):
+    with serial_blas(), pulses_to(monitor.pulse), singular_refused():
         found = cameras_of(observations, monitor)
     monitor.report(Step("finish", 1.0))
     return found

@@ -9,7 +9,7 @@ from pliant.solver.agreement import check_tracks, check_type
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.energy.hyperparameters import noise_std
-from pliant.solver.errors import InvalidInput
+from pliant.solver.errors import InvalidInput, singular_refused
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import ShouldStop, pulses_to
@@ -112,6 +112,8 @@ def learn_prior(
     ------
     InvalidInput
         The cameras were estimated from other tracks or are no `Cameras`, or the tracks are no valid `Tracks`.
+    NotFinite
+        Rounding errors made equations singular.
     """
     check_tracks(tracks)
     check_type("cameras", cameras, Cameras, MAKE_ESTIMATE)
@@ -129,7 +131,7 @@ def learn_prior(
     monitor = monitored(
         tracks, observations.known, observations.settings, on_step, should_stop, only=("model_order", "covariance")
     )
-    with serial_blas(), pulses_to(monitor.pulse):
+    with serial_blas(), pulses_to(monitor.pulse), singular_refused():
         found = prior_of(cameras, monitor, seed=observations.settings.seed if seed is None else seed)
     monitor.report(Step("finish", 1.0))
     return found
@@ -145,7 +147,7 @@ def _with_learning_data(cameras: Cameras, should_stop: ShouldStop | None) -> Cam
     known = KnownCamera(camera.rotations, camera.scales / observations.world_scale, camera.focal, centre)
     lens = given_lens(observations.normalized, settings, known)
     monitor = monitored(observations.tracks, known, settings, None, should_stop, only=STAGES)
-    with serial_blas(), pulses_to(monitor.pulse):
+    with serial_blas(), pulses_to(monitor.pulse), singular_refused():
         return cameras_of(replace(observations, settings=settings, known=known, lens=lens), monitor)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from pliant.solver.agreement import check_mesh, check_tracks
+from pliant.solver.errors import singular_refused
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.pulse import ShouldStop, pulses_to
@@ -67,7 +68,7 @@ def solve_shapes(
     InvalidSettings
         The settings select another prior than the given one, or require a mesh that is a grid.
     NotFinite
-        The arithmetic overflowed.
+        The arithmetic overflowed, or rounding errors made equations singular.
     OSError
         The folder `scratch` is missing, cannot be written to, or has too little space.
     """
@@ -81,7 +82,7 @@ def solve_shapes(
     check_mesh(tracks, mesh, settings)
     settings = without_learned_prior(settings) if prior is None else settings
     monitor = monitored(tracks, None, settings, on_step, should_stop, only=("shapes", "finish", "trust"))
-    with serial_blas(), pulses_to(monitor.pulse):
+    with serial_blas(), pulses_to(monitor.pulse), singular_refused():
         return shapes_of(
             tracks, cameras, prior, mesh, settings, monitor,
             seconds={}, start=None if first is None else first * observations.world_scale, scratch=scratch,

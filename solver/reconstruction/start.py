@@ -10,7 +10,7 @@ from pliant.solver.agreement import MAKE_MESH, MAKE_SETTINGS, check_mesh, check_
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import orthographic
 from pliant.solver.energy.problem import Problem
-from pliant.solver.errors import InvalidInput, InvalidSettings
+from pliant.solver.errors import InvalidInput, InvalidSettings, singular_refused
 from pliant.solver.mesh import Mesh
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor
@@ -114,12 +114,14 @@ def find_outliers(
         Mesh, cameras or prior do not match the tracks, these are no valid `Tracks`, or an argument has another type.
     InvalidSettings
         The settings select another prior than the given one.
+    NotFinite
+        Rounding errors made equations singular.
     """
     check_tracks(tracks)
     check_types(cameras, prior, mesh, settings)
     used = cameras.observations.settings if settings is None else settings
     monitor = monitored(tracks, None, used, on_step, should_stop, only=("shapes",))
-    with serial_blas(), pulses_to(monitor.pulse):
+    with serial_blas(), pulses_to(monitor.pulse), singular_refused():
         found = begin(tracks, cameras, prior, mesh, used, monitor).rejected()
     monitor.report(Step("finish", 1.0))
     return found

@@ -63,8 +63,9 @@ def normalize(tracks: Tracks) -> Normalized:
     unit = float(np.sqrt(np.einsum("fp,fpc,fpc->", weight, points, points) / total.sum()))
     if not unit > 1e-12 * max(float(np.abs(centroid).max()), np.finfo(float).tiny):
         raise InvalidInput(
-            "no_extent", field="tracks", expected="points that differ from each other", got="one position for all points",
-            hint="Check that the points' axis is the second one and that the tracks are not all zero.",
+            "no_extent", field="tracks", expected="points that differ from each other in a frame",
+            got="one position for all visible points of each frame",
+            hint="Check that the points' axis is the second one, that the tracks are not all zero, and that frames show several points.",
         )  # fmt: skip
     points /= unit
     read_only(points)
@@ -92,8 +93,11 @@ def _near(tracks: Tracks, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
             middle = np.median(tracks.points[frame, mask], axis=0)
             radius[frame] = np.hypot(*(tracks.points[frame] - middle).T)
     pulse()
-    near &= radius <= MAX_MEDIAN_RADII * _median(radius[seen])
-    return near if near.any() else seen
+    typical = _median(radius[seen])
+    if typical == 0:  # as where most frames show a single point
+        return seen
+    near &= radius <= MAX_MEDIAN_RADII * typical
+    return near
 
 
 def _median(values: Floats) -> float:

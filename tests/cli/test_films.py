@@ -125,7 +125,7 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
     assert "warning Only 5 frames are tracked." in words
     blank = [np.full((72, 96, 3), 40 + shade, np.uint8) for shade in range(4)]
     dark = films.write_film(tmp_path / "dark.mp4", [*blank, *films.textured_pictures(4, (96, 72))])
-    assert "points none: no texture in the region in frame 2" in " ".join(
+    assert "note Frame 2 shows no texture that can be tracked." in " ".join(
         inspect(dark, "-O", "region_frame=2").output.split()
     )
     assert "warning" not in inspect(film, "-O", "region_polygon=[[20,20],[70,20],[70,55]]").output

@@ -130,7 +130,7 @@ def not_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ("x.csv", "sheet.jpg", "--output: expected a name that ends in .npz"),
         ("x", "sheet.jpg", "--output: expected a name that ends in .npz"),
-        ("x.npz", "sheet.png", "--preview: expected a name that ends in .jpg or .jpeg"),
+        ("x.npz", "sheet.gif", "--preview: expected a name that ends in .jpg, .jpeg or .png"),
         ("x" * 252 + ".npz", "sheet.jpg", "File name too long"),
     ],
 )
@@ -150,8 +150,13 @@ def test_a_file_may_have_the_longest_name(tmp_path: Path) -> None:
         aside.write_text("content")
         assert aside.parent == tmp_path
     assert [each.name for each in tmp_path.iterdir()] == ["x" * 251 + ".npz"]
+
+
+@pytest.mark.parametrize(("name", "starts"), [("a.JPEG", b"\xff\xd8\xff"), ("a.PNG", b"\x89PNG\r\n")])
+def test_the_preview_has_the_format_of_its_name(tmp_path: Path, name: str, starts: bytes) -> None:
     film = films.write_film(tmp_path / "film.mkv", films.textured_pictures(4, (48, 36)))
-    assert track(film, "-o", tmp_path / "A.NPZ", "--preview", tmp_path / "a.JPEG").exit_code == 0
+    assert track(film, "-o", tmp_path / "A.NPZ", "--preview", tmp_path / name).exit_code == 0
+    assert (tmp_path / name).read_bytes().startswith(starts)
 
 
 def test_a_preview_is_no_frame_of_the_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,11 +187,11 @@ def test_a_name_that_is_no_utf_8_is_refused(tmp_path: Path) -> None:
 def test_earlier_tracks_survive_a_full_disk(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "tracks.npz").write_bytes(b"earlier")
 
-    def full(stream: IO[bytes], **arrays: object) -> None:
+    def full(stream: IO[bytes], header: object) -> None:
         stream.write(b"half")
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(np, "savez_compressed", full)
+    monkeypatch.setattr(np.lib.format, "write_array_header_1_0", full)
     ran = CliRunner().invoke(app, ["track", str(small), "-o", str(tmp_path / "tracks.npz"), "--force"])
     assert ran.exit_code == 3, ran.output
     assert (tmp_path / "tracks.npz").read_bytes() == b"earlier"

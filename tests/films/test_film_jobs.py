@@ -50,6 +50,7 @@ from pliant.worker.films.tracker import (
     film_options,
     read_film,
     track_film,
+    with_estimate,
 )
 from pliant.worker.formats import Inputs
 from pliant.worker.formats.cost import LIBRARIES, estimated
@@ -80,6 +81,21 @@ def refusal(source: FilmSource, options: Options = Options(), bounds: FilmBounds
     with pytest.raises(InvalidInput) as refused:
         read_film(source, options, bounds)
     return refused.value
+
+
+@forked
+def test_the_estimate_of_a_film_is_limited_like_its_check(film: Path) -> None:
+    source = FilmSource(film)
+    read = read_film(source, Options(max_points=40))
+    assert read.interpretation.estimate is None
+    estimate = with_estimate(read, source, threads=1).interpretation.estimate
+    assert estimate is not None
+    assert estimate.tracking_seconds is not None
+    assert estimate.tracking_seconds > 0
+    assert estimate.seconds == estimated(10, 40, read.options).seconds
+    with pytest.raises(InvalidInput) as refused:
+        with_estimate(read, source, FilmBounds(check_seconds=0.01), threads=1)
+    assert refused.value.code == "too_slow"
 
 
 @forked

@@ -194,6 +194,10 @@ def test_a_repeated_submission_keeps_its_key_until_the_service_has_answered(
         send.click()
         heard(page, lambda count=count: len(keys) == count)
         expect(send).to_be_enabled()
+        advice = page.get_by_text(
+            "status 504 and no explanation. It may be starting, ending or busy: try again in a moment."
+        )
+        expect(advice).to_have_count(1 if count == 2 else 0)
     assert keys[0] == keys[1] == keys[2] != keys[3]
 
 

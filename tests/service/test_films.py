@@ -20,9 +20,11 @@ from pliant.cli.exits import Exit
 from pliant.cli.session import Session
 from pliant.client import BadArgument, Client
 from pliant.schemas.job import Job, Status
+from pliant.service import submission
 from pliant.service.multipart import own_name
 from pliant.service.submission import FILES
 from pliant.worker.execution import attempt
+from pliant.worker.formats import InvalidInput
 from serving import Running, tracks, until
 from typer.testing import CliRunner
 
@@ -131,8 +133,36 @@ def test_inspection_reads_a_film_without_tracking_it(running: Running, http: htt
     assert answer.status_code == 200, answer.text
     assert (answer.json()["num_frames"], answer.json()["num_points"], answer.json()["sample"]) == (10, 0, [])
     assert base64.b64decode(answer.json()["first_frame"]).startswith(b"\xff\xd8\xff")
+    part, whole = (each.json()["estimate"] for each in (answer, http.post("/v1/inspect", files=parts(film))))
+    assert 1e8 < part["memory_bytes"] < whole["memory_bytes"] < 1e9, "fewer points"
+    assert 0 < part["tracking_seconds"] < 60
+    assert 0 < part["seconds"] < whole["seconds"] < 60
     assert http.post("/v1/inspect", files={"tracks": tracks()}).json()["first_frame"] is None
     assert running.waiting == before
+
+
+@forked
+def test_an_inspection_notes_a_film_without_texture(http: httpx.Client, tmp_path: Path) -> None:
+    blank = [np.full((72, 96, 3), 100 + 5 * i, np.uint8) for i in range(6)]
+    film = films.write_film(tmp_path / "blank.mp4", blank).read_bytes()
+    read = http.post("/v1/inspect", files=parts(film)).json()
+    assert read["estimate"] is None
+    assert read["notes"][-1].startswith("Frame 0 shows no texture that can be tracked.")
+
+
+@forked
+def test_a_film_whose_time_cannot_be_estimated_is_inspected(
+    http: httpx.Client, film: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is accepted as a job, which decodes less of it before it is queued."""
+
+    def fail(*_: object, **__: object) -> None:
+        raise InvalidInput("too_slow", field="film", expected="", got="", hint="")
+
+    monkeypatch.setattr(submission, "with_estimate", fail)
+    answer = http.post("/v1/inspect", files=parts(film, region=mask()))
+    assert answer.status_code == 200, answer.text
+    assert (answer.json()["num_frames"], answer.json()["estimate"]) == (10, None)
 
 
 KINDS = "an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures"
@@ -304,9 +334,9 @@ def test_client_and_command_line_send_films(running: Running, film: bytes, tmp_p
     command[0] = "inspect"
     ran = CliRunner().invoke(app, command, obj=Session())
     assert ran.exit_code == 0, ran.output
-    assert json.loads(ran.stdout) == job.record.interpretation.model_dump(mode="json")
-    words = CliRunner().invoke(app, command[:-1], obj=Session()).output
-    assert words.split() == ["film", *job.record.interpretation.notes[0].split()]
+    assert json.loads(ran.stdout) | {"estimate": None} == job.record.interpretation.model_dump(mode="json")
+    words = " ".join(CliRunner().invoke(app, command[:-1], obj=Session()).output.split())
+    assert words.startswith(f"film {job.record.interpretation.notes[0]} estimate about 0.1 GB of memory, tracking ")
     region.write_bytes(mask((48, 36)))  # it is sent as well
     refused = CliRunner().invoke(app, command[:-1], obj=Session())
     assert (refused.exit_code, "region" in refused.output) == (Exit.REFUSED, True)

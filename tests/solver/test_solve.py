@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,11 @@ from pliant.solver import (
     Step,
     Tracks,
     estimate_cameras,
+    find_outliers,
     gallery,
+    learn_prior,
     solve,
+    solve_shapes,
 )
 from waving_sheet import cameras_of, project, sheet, triangulated, turning
 
@@ -121,6 +125,28 @@ def test_the_grid_stencil_needs_a_grid() -> None:
             tracks, triangulated(sheet()[1]), cameras=cameras_of(rotations), settings=Settings(laplacian="grid8"),
             should_stop=lambda: pytest.fail("before any work"),
         )  # fmt: skip
+
+
+def test_equations_that_are_singular_to_rounding_are_an_error_of_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:
+    def singular(*_: object, **__: object) -> None:
+        raise np.linalg.LinAlgError("not positive definite")
+
+    _, rotations, tracks, mesh = scene()
+    known = cameras_of(rotations)
+    cameras = estimate_cameras(tracks, known)
+    prior = learn_prior(tracks, cameras)
+    calls: tuple[tuple[str, Callable[[], object]], ...] = (
+        ("reconstruct.cameras_of", lambda: solve(tracks, mesh, cameras=known)),
+        ("reconstruction.cameras.cameras_of", lambda: estimate_cameras(tracks, known)),
+        ("reconstruction.prior.prior_of", lambda: learn_prior(tracks, cameras)),
+        ("reconstruction.start.begin", lambda: find_outliers(tracks, cameras, prior)),
+        ("reconstruction.solve_shapes.shapes_of", lambda: solve_shapes(tracks, cameras, prior)),
+    )
+    for name, call in calls:
+        with monkeypatch.context() as patched:
+            patched.setattr(f"pliant.solver.{name}", singular)
+            with pytest.raises(NotFinite, match=r"singular \(not positive definite\)"):
+                call()
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")

@@ -45,3 +45,20 @@ def test_a_missing_folder_or_a_full_disk_is_an_error(tmp_path: Path, monkeypatch
     monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
     with pytest.raises(OSError, match="no space for 96 bytes"):
         allocated((3, 4), tmp_path)
+
+
+def test_mapped_arrays_have_the_given_type_and_are_let_go_by_their_views(tmp_path: Path) -> None:
+    resident = Path("/proc/self/statm")
+    if not resident.exists():
+        pytest.skip("needs the resident memory of this process")
+
+    def pages() -> int:
+        return int(resident.read_text().split()[1])
+
+    array = allocated((2048, 4096), tmp_path, np.float32)
+    assert array.dtype == np.float32
+    array[:] = 1.0
+    before = pages()
+    let_go(array[1:, :7][:, 2:])
+    assert pages() < before - array.nbytes // 8192
+    assert float(array[:, ::512].sum()) == 2048 * 8

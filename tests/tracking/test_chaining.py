@@ -94,23 +94,29 @@ def test_points_are_recovered_after_an_occlusion() -> None:
     assert np.percentile(np.linalg.norm(result.points - true, axis=2)[5:, left], 90) < 0.3
 
 
+def confidence_of(visible: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Return the confidence of all frames."""
+    chained = Chain(np.zeros((*visible.shape, 2), np.float32), visible, variance)
+    return chained.confidence(slice(None), chained.usual_variance())
+
+
 def test_confidence_ignores_the_template_if_most_observations_are_in_it() -> None:
     visible, variance = np.zeros((4, 10), bool), np.full((4, 10), 0.04, np.float32)
     visible[0], visible[1:, :3], variance[0] = True, True, 0.0
     variance[1, 0] = 0.4
-    found = Chain(np.zeros((4, 10, 2), np.float32), visible, variance).confidence
+    found = confidence_of(visible, variance)
     assert (found[0] == 1).all()
     assert found[2, :3] == pytest.approx(1)
     assert found[1, 0] == pytest.approx(0.1)
     assert (found[~visible] == 0).all()
-    exact = Chain(np.zeros((4, 10, 2), np.float32), visible, np.zeros((4, 10), np.float32)).confidence
+    exact = confidence_of(visible, np.zeros((4, 10), np.float32))
     assert (exact == visible).all()
 
 
 def test_confidence_ignores_frames_identical_to_the_template_if_most_observations_are_in_them() -> None:
     visible, variance = np.ones((6, 10), bool), np.full((6, 10), 1.5 * ROUNDING, np.float32)
     variance[0], variance[4], variance[5] = 0.0, 1.0, 2.0
-    found = Chain(np.zeros((6, 10, 2), np.float32), visible, variance).confidence
+    found = confidence_of(visible, variance)
     assert (found[:5] == 1).all()
     assert found[5] == pytest.approx(0.75)
 

@@ -12,7 +12,7 @@ from pliant.tracking.chaining import Chain
 from pliant.tracking.errors import FilmError, TrackingStopped
 from pliant.tracking.registration import Registration
 from pliant.tracking.seeding import neighbours, place
-from pliant.tracking.trajectories import move_to_expected, track_again
+from pliant.tracking.trajectories import WINDOW, move_to_expected, track_again, windows
 
 FRAMES = 12
 
@@ -32,7 +32,7 @@ def test_expected_positions_correct_uncertain_and_fill_hidden_ones() -> None:
     tracked[8:11, :20] += 2
     variance[8:11, :20] = 1
     tracked[2:6, 20:40], visible[2:6, 20:40] = 0, False
-    move_to_expected(Chain(tracked, visible, variance), bool)
+    move_to_expected(Chain(tracked, visible, variance), 0, bool)
     error = np.linalg.norm(tracked - true, axis=2)
     assert error[8:11, :20].mean() < 0.5
     assert error[2:6, 20:40].mean() < 0.2
@@ -43,7 +43,7 @@ def test_computing_expected_positions_can_be_stopped() -> None:
     points = turning(np.random.default_rng(0).uniform(20, 140, (60, 2)).astype(np.float32))
     chained = Chain(points, np.ones((FRAMES, 60), bool), np.full((FRAMES, 60), 0.01, np.float32))
     with pytest.raises(TrackingStopped):
-        move_to_expected(chained, lambda: True)
+        move_to_expected(chained, 0, lambda: True)
 
 
 @pytest.mark.parametrize("seen", [1, 3])
@@ -53,12 +53,47 @@ def test_too_few_points_beyond_the_template_are_lost_tracks(seen: int) -> None:
     visible[0] = True
     visible[1:3, :seen] = True
     with pytest.raises(FilmError) as caught:
-        move_to_expected(Chain(points, visible, np.full((FRAMES, 60), 0.01, np.float32)), bool)
+        move_to_expected(Chain(points, visible, np.full((FRAMES, 60), 0.01, np.float32)), 0, bool)
     assert str(caught.value) == (
         f"film: expected at least 4 points that stay visible beyond the template, got {seen}. Film more slowly and with more light, so "
         "that successive frames overlap and are not blurred."
     )
     assert caught.value.code == "tracks_lost"
+
+
+def test_windows_cover_the_film_once_and_hold_the_template() -> None:
+    assert [list(rows) for rows in windows(5, 2)] == [list(range(5))]
+    for frames, template in ((WINDOW, 0), (WINDOW + 1, WINDOW), (3 * WINDOW, 700), (3 * WINDOW + 2, 0)):
+        found = windows(frames, template)
+        assert len(found) == -(-frames // WINDOW)
+        assert all(len(rows) <= WINDOW + 1 and template in rows for rows in found)
+        assert sorted(np.concatenate([rows[rows != template] for rows in found])) == [
+            t for t in range(frames) if t != template
+        ]
+
+
+def test_long_films_are_fitted_in_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pliant.tracking.trajectories.WINDOW", 6)
+    points = np.random.default_rng(0).uniform(20, 140, (200, 2)).astype(np.float32)
+    true = turning(points)
+    tracked, visible = true.copy(), np.ones((FRAMES, 200), bool)
+    tracked[8:10, :20] += 2
+    variance = np.where(tracked[..., 0] != true[..., 0], 1.0, 0.01).astype(np.float32)
+    tracked[2:6, 20:40], visible[2:6, 20:40] = 0, False
+    move_to_expected(Chain(tracked, visible, variance), 6, bool)
+    assert np.linalg.norm(tracked - true, axis=2).max() < 0.3
+    assert np.array_equal(tracked[6], true[6])
+
+
+def test_a_window_without_points_keeps_its_positions(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pliant.tracking.trajectories.WINDOW", 4)
+    points = np.random.default_rng(0).uniform(20, 140, (60, 2)).astype(np.float32)
+    tracked, visible = turning(points), np.ones((FRAMES, 60), bool)
+    tracked[4:8], visible[4:8] = 7.0, False
+    before = tracked.copy()
+    move_to_expected(Chain(tracked, visible, np.full((FRAMES, 60), 0.01, np.float32)), 0, bool)
+    assert np.array_equal(tracked[4:8], before[4:8])
+    assert 0 < np.abs(tracked - before).max() < 0.5
 
 
 def test_memory_for_expected_positions_is_proportional_to_the_tracks() -> None:
@@ -68,7 +103,7 @@ def test_memory_for_expected_positions_is_proportional_to_the_tracks() -> None:
     chained = Chain(points.copy(), np.ones((frames, count), bool), np.ones((frames, count), np.float32))
     tracemalloc.start()
     try:
-        move_to_expected(chained, bool)
+        move_to_expected(chained, 0, bool)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -135,7 +170,7 @@ def test_lost_points_off_their_paths_are_found_with_the_others(monkeypatch: pyte
     visible[1:, lost] = False
     points = true.copy()
     points[1:, lost] += np.float32([0, 2.5])
-    monkeypatch.setattr("pliant.tracking.trajectories.move_to_expected", lambda chained, should_stop: None)
+    monkeypatch.setattr("pliant.tracking.trajectories.move_to_expected", lambda chained, template, should_stop: None)
     result, *_ = again(Chain(points, visible, np.full(visible.shape, 0.01, np.float32)))
     assert result.visible[1:, lost].mean() > 0.95
     error = np.linalg.norm(result.points - true, axis=2)[1:, lost]

@@ -58,7 +58,7 @@ OPTIONS = ("frames", *PLANNED)
 
 
 def main() -> int:
-    """Check or track the film of the request on standard input; answer on standard output."""
+    """Check, estimate or track the film of the request on standard input; answer on standard output."""
     return serve(_answer)
 
 
@@ -71,10 +71,10 @@ def _answer(request: dict[str, Any]) -> str:
             "film_unavailable", field="film", expected="tracks, or a service with OpenCV", got="a film",
             hint="Install the extra film beside service and worker (pip install '.[film]' in Pliant's source folder), or send tracks.",
         ) from error  # fmt: skip
-    if request["action"] == "track" or request["estimate"]:
+    if request["action"] != "check":
         import_module("pliant.tracking.track")  # before the memory limit, which is meant for the film
     bounds = FilmBounds(**request["bounds"] | {"limits": FilmLimits(**request["bounds"]["limits"])})
-    seconds = bounds.check_seconds if request["action"] == "check" else bounds.track_seconds * request["threads"]
+    seconds = bounds.track_seconds * request["threads"] if request["action"] == "track" else bounds.check_seconds
     limit_process(
         {
             resource.RLIMIT_AS: bounds.memory,
@@ -127,14 +127,19 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
         "stated_frames": film.stated_frames, "frames": count or 0, "seconds": film.stated_frames / film.fps,
         "rotation": film.rotation, "pixel_aspect": film.pixel_aspect,
     }  # fmt: skip
-    if request["estimate"]:
-        from pliant.tracking.estimate import estimate
-
-        expected = estimate(film, region=region, threads=request["threads"], **planned)
-        facts |= {"points": expected.points, "track_seconds": expected.seconds}
     if request["picture"]:
         facts["first_frame"] = _first_frame(request, bounds)
     return facts
+
+
+def _estimate(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
+    """Estimate the number of points and the time of tracking; decodes the film up to the frame of the region."""
+    from pliant.tracking.estimate import estimate
+
+    expected = estimate(
+        _opened(request, bounds), region=_region(request), threads=request["threads"], **_planned(request)
+    )
+    return {"points": expected.points, "track_seconds": expected.seconds}
 
 
 def _first_frame(request: dict[str, Any], bounds: FilmBounds) -> str:
@@ -166,7 +171,11 @@ def _track(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
     return {"container": tracked.film.container, "fps": tracked.fps, "warnings": list(tracked.warnings)}
 
 
-_ACTIONS: dict[str, Callable[[dict[str, Any], FilmBounds], dict[str, Any]]] = {"check": _check, "track": _track}
+_ACTIONS: dict[str, Callable[[dict[str, Any], FilmBounds], dict[str, Any]]] = {
+    "check": _check,
+    "estimate": _estimate,
+    "track": _track,
+}
 
 
 def _opened(request: dict[str, Any], bounds: FilmBounds) -> Film:

@@ -1,4 +1,4 @@
-"""Check or track a film in the film process and read its results."""
+"""Check a film, estimate the effort of tracking it, or track it, in the film process, and read its results."""
 
 from __future__ import annotations
 
@@ -69,6 +69,15 @@ class FilmFacts(BaseModel):
 
     first_frame: Annotated[str, Field(max_length=1 << 20, pattern=r"^[A-Za-z0-9+/]*={0,2}$")] = ""
     """First frame of the complete film as a JPEG in base64; empty if not requested."""
+
+
+class Effort(BaseModel):
+    """Expected effort of tracking a film."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    points: Count
+    track_seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class Tracked(BaseModel):
@@ -170,7 +179,7 @@ class ReadFilm:
     """With the film's picture size and frame rate."""
 
     interpretation: Interpretation
-    """Of the film before it is tracked; `estimate` is that of the reconstruction, where frames and points were estimated."""
+    """Of the film before it is tracked; `estimate` only after `with_estimate`."""
 
 
 def read_film(
@@ -178,13 +187,11 @@ def read_film(
     options: Options,
     bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
     *,
-    estimate: bool = False,
     picture: bool = False,
-    threads: int = 1,
 ) -> ReadFilm:
     """Open a film and its region, and check all options of its job, without tracking it; takes seconds, regardless of the film's length.
 
-    `estimate` adds the expected number of points and the tracking time on `threads` threads; `picture` adds the first frame.
+    `picture` adds the first frame.
 
     Raises
     ------
@@ -193,17 +200,42 @@ def read_film(
     """
     _check_region(source, options)
     with TemporaryDirectory(prefix="pliant-film-") as scratch:
-        ended = _run(
-            "check", source, options, bounds, Path(scratch), threads=threads, estimate=estimate, picture=picture
-        )
+        ended = _run("check", source, options, bounds, Path(scratch), picture=picture)
     facts = _answer(FilmFacts, ended, bounds, bounds.check_seconds)
     options = film_options(options, facts)
     solver_settings(options)
-    interpretation = described(facts, options, has_region=source.has_region(options))
+    return ReadFilm(facts, options, described(facts, options, has_region=source.has_region(options)))
+
+
+def with_estimate(
+    read: ReadFilm,
+    source: FilmSource,
+    bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
+    *,
+    threads: int,
+) -> ReadFilm:
+    """Return a checked film with the expected number of points, and the time and memory of its job on `threads` threads.
+
+    Decodes the film up to the frame of the region.
+
+    Raises
+    ------
+    InvalidInput
+        The film cannot be decoded so far, or not within the limits of a check.
+    """
+    with TemporaryDirectory(prefix="pliant-film-") as scratch:
+        ended = _run("estimate", source, read.options, bounds, Path(scratch), threads=threads)
+    effort = _answer(Effort, ended, bounds, bounds.check_seconds)
+    facts, interpretation = read.facts.model_copy(update=effort.model_dump()), read.interpretation
     if facts.frames and facts.points:
-        points = min(facts.points, options.max_points or facts.points)
-        interpretation = interpretation.model_copy(update={"estimate": estimated(facts.frames, points, options)})
-    return ReadFilm(facts, options, interpretation)
+        points = min(facts.points, read.options.max_points or facts.points)
+        expected = estimated(facts.frames, points, read.options)
+        expected = expected.model_copy(update={"tracking_seconds": round(facts.track_seconds, 1)})
+        interpretation = interpretation.model_copy(update={"estimate": expected})
+    if facts.points == 0:
+        note = f"Frame {read.options.region_frame} shows no texture that can be tracked. If the whole film is like it, the job fails."
+        interpretation = interpretation.model_copy(update={"notes": [*interpretation.notes, note]})
+    return ReadFilm(facts, read.options, interpretation)
 
 
 def described(facts: FilmFacts, options: Options, *, has_region: bool = False) -> Interpretation:
@@ -256,11 +288,11 @@ def _check_region(source: FilmSource, options: Options) -> None:
 
 
 def _run(
-    action: str, source: FilmSource, options: Options, bounds: FilmBounds, scratch: Path, *, threads: int, estimate: bool = False,
-    picture: bool = False, on_line: Callable[[dict[str, Any]], None] | None = None, should_stop: Callable[[], bool] | None = None,
+    action: str, source: FilmSource, options: Options, bounds: FilmBounds, scratch: Path, *, threads: int = 1, picture: bool = False,
+    on_line: Callable[[dict[str, Any]], None] | None = None, should_stop: Callable[[], bool] | None = None,
 ) -> Ended:  # fmt: skip
     request = {
-        "action": action, "film": str(source.film.absolute()), "threads": max(1, min(threads, 64)), "estimate": estimate,
+        "action": action, "film": str(source.film.absolute()), "threads": max(1, min(threads, 64)),
         "picture": picture, "region": None if source.region is None else str(source.region.absolute()),
         "names": source.names, "options": options.model_dump(mode="json", include=TRACKING_OPTIONS),
         "bounds": asdict(bounds), "folder": str(scratch.absolute()),
@@ -268,7 +300,7 @@ def _run(
     return run_contained(
         MODULE,
         request,
-        seconds=bounds.check_seconds if action == "check" else bounds.track_seconds,
+        seconds=bounds.track_seconds if action == "track" else bounds.check_seconds,
         directory=str(scratch),
         environment={"TMPDIR": str(scratch.absolute()), "MALLOC_ARENA_MAX": "2"},
         on_line=on_line,
@@ -276,7 +308,7 @@ def _run(
     )
 
 
-Answer = TypeVar("Answer", FilmFacts, Tracked)
+Answer = TypeVar("Answer", FilmFacts, Effort, Tracked)
 
 
 def _answer(kind: type[Answer], ended: Ended, bounds: FilmBounds, seconds: float) -> Answer:

@@ -84,7 +84,8 @@ def read_rotations(path: Path, *, num_frames: int, frames: NDArray[np.intp], lim
     if turned.dtype.kind not in "fiu" or turned.ndim != 3 or len(turned) != num_frames:
         raise InvalidInput(
             "wrong_shape", field="rotations", expected=f"({num_frames}, 2, 3) or ({num_frames}, 3, 3), real",
-            got=f"{turned.dtype} {arrays[name].shape}", hint="Give one rotation for each frame of the tracks.",
+            got=f"{turned.dtype} {arrays[name].shape}",
+            hint=f"Give one rotation for each of the {num_frames} frames; if the tracks have another number, set the option layout.",
         )  # fmt: skip
     scales = arrays.get("scales")
     if scales is not None and scales.size == num_frames:

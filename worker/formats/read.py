@@ -257,8 +257,9 @@ def _check_extent(tracks: Tracks) -> None:
     high = np.where(seen, tracks.points, -np.inf).max(axis=1)
     if not (high > low).any():
         raise InvalidInput(
-            "no_extent", field="tracks", expected="points that differ from each other", got="one position for all points",
-            hint="Check that the points' axis is the second one and that the tracks are not all zero.",
+            "no_extent", field="tracks", expected="points that differ from each other in a frame",
+            got="one position for all visible points of each frame",
+            hint="Check that the points' axis is the second one, that the tracks are not all zero, and that frames show several points.",
         )  # fmt: skip
 
 

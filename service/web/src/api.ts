@@ -96,13 +96,14 @@ function problemOf(status: number, text: string): Problem {
   } catch {
     // Not JSON: a proxy's page, or an empty body. Only the status is known.
   }
+  // A service that ends, or a proxy while the service restarts or is busy, answers so.
+  const retryable = status >= 500 || status === 408 || status === 429;
   return {
     title: "Refused",
     status,
-    detail: `The service answered with status ${status} and no explanation. See its log for details.`,
+    detail: `The service answered with status ${status} and no explanation. ${retryable ? "It may be starting, ending or busy: try again in a moment. " : ""}Its log has details.`,
     code: "unknown",
-    // A proxy answers so while the service restarts or is busy.
-    retryable: status >= 500 || status === 408 || status === 429,
+    retryable,
   };
 }
 

@@ -2,11 +2,12 @@
 
 import { type Example, Refusal, exampleFile, getOptions, isAbort, listExamples, newKey, submit } from "./api";
 import { button, h } from "./dom";
-import { OptionsForm, chosen, drawn, nameOf } from "./options";
+import { keepOptions, keptOptions } from "./draft";
+import { OptionsForm, chosen, drawn, nameOf, statedBy } from "./options";
 import { refusalBox } from "./refusal";
-import { remember, rememberSame } from "./sent";
+import { remember, rememberSame, rememberTime } from "./sent";
 import { PLACES, Slots } from "./slots";
-import { type Job, PARTS, type Part } from "./types";
+import { type Interpretation, type Job, PARTS, type Part } from "./types";
 import { Inspection } from "./understood";
 import { percent, title } from "./words";
 
@@ -20,7 +21,11 @@ export class Compose {
   private readonly inspection = new Inspection(
     () => this.form(),
     (refusal) => (refusal ? this.refuse(refusal, "Not read", () => undefined) : this.clear()),
-    (seen) => void this.slots.seen(seen),
+    (seen) => {
+      this.seen = seen;
+      this.options.state(statedBy(seen));
+      void this.slots.seen(seen);
+    },
   );
   private readonly label = h("input", { type: "text", id: "job-name", maxlength: 200, autocomplete: "off" });
   private readonly send = h("button", { type: "submit", class: "primary" }, "Reconstruct");
@@ -34,8 +39,12 @@ export class Compose {
   /** The job whose inputs are reused; null: the files in the form. */
   private kept: Job | null = null;
   private readonly keeping = h("div", { class: "keeping", hidden: true });
+  /** Names the options that were restored after a reload. */
+  private readonly restored = h("div", { class: "row hint", hidden: true });
   /** The automatically filled-in name; a name typed by the user is not overwritten. */
   private filledIn = "";
+  /** How the service reads the files and options in the form; null: not known yet, or not any more. */
+  private seen: Interpretation | null = null;
   /** The file or job that the filled-in name is of. */
   private named: File | Job | null = null;
 
@@ -48,6 +57,7 @@ export class Compose {
       this.examples,
       this.inspection.element,
       h("div", { class: "option" }, h("label", { for: "job-name" }, "Name (optional)"), this.label),
+      this.restored,
       this.options.element,
       h("div", { class: "send" }, this.answer, h("div", { class: "row" }, this.send, this.stop)),
     );
@@ -58,7 +68,12 @@ export class Compose {
       if (fold) fold.open = true;
     };
     form.addEventListener("invalid", unfold, true);
-    this.options.element.addEventListener("change", () => this.changed());
+    this.options.element.addEventListener("change", () => {
+      const given = this.options.values();
+      if (!this.kept) keepOptions(given);
+      if (Object.keys(given).length === 0) this.restored.hidden = true;
+      this.changed();
+    });
     this.element = h("details", { class: "card", open: true }, summary, form);
     document.addEventListener("drop", () => (this.element.open = true));
   }
@@ -68,10 +83,13 @@ export class Compose {
     const { main } = this.slots;
     if (!this.kept && main !== this.named) {
       this.named = main;
+      this.options.state(this.slots.file("film") ? statedBy(null) : {});
       const stem = main?.name.replace(/\.[^.]*$/, "").slice(0, 200) ?? "";
       if (this.label.value === this.filledIn) this.label.value = this.filledIn = stem;
     }
     this.offerExamples();
+    this.guard();
+    this.seen = null;
     if (!this.sending) this.inspection.changed();
   }
 
@@ -88,6 +106,7 @@ export class Compose {
   async load(): Promise<void> {
     const schema = await getOptions();
     this.options.load(schema);
+    this.restore();
     if (schema.properties && "region_polygon" in schema.properties) this.slots.acceptFilms();
     try {
       const { examples } = await listExamples();
@@ -97,6 +116,20 @@ export class Compose {
       if (!(error instanceof Refusal)) throw error;
       this.examples.replaceChildren(); // the examples are optional
     }
+  }
+
+  /** Fill in the options that were chosen before the page was reloaded, and say so. */
+  private restore(): void {
+    const kept = keptOptions();
+    if (Object.keys(kept).length === 0) return;
+    this.options.restore(kept);
+    const names = Object.keys(this.options.values()).map(nameOf);
+    const reset = button("Use the defaults", () => {
+      this.options.reset();
+      this.options.focus();
+    }, { class: "link" });
+    this.restored.replaceChildren(h("span", {}, `Options from before the page was reloaded: ${names.join(", ")}.`), reset);
+    this.restored.hidden = names.length === 0;
   }
 
   private exampleButtons(examples: Example[]): (Node | string)[] {
@@ -111,6 +144,7 @@ export class Compose {
   /** Fill the form with the options of a job, to run its inputs again with different ones. */
   again(job: Job): void {
     this.keep(job);
+    this.options.state(statedBy(job.interpretation));
     this.options.fill(chosen(job));
     this.named = job;
     this.label.value = this.filledIn = job.name;
@@ -121,6 +155,7 @@ export class Compose {
 
   private keep(job: Job | null): void {
     this.kept = job;
+    if (job) this.restored.hidden = true; // the options are the job's
     this.inspection.stop();
     this.clear();
     this.keeping.hidden = job === null;
@@ -214,7 +249,11 @@ export class Compose {
       this.unsure = null;
       this.answer.replaceChildren();
       if (this.kept) rememberSame(job.id, this.kept.id);
-      else remember(job.id, files);
+      else {
+        remember(job.id, files);
+        rememberTime(job.id, this.seen?.estimate ?? null);
+        this.slots.saved();
+      }
       this.onJob(job);
     } catch (error) {
       const unknown = isAbort(error) ? sent : error instanceof Refusal && error.problem.retryable;
@@ -249,14 +288,18 @@ export class Compose {
     return form;
   }
 
-  /** Ask before the page is left: leaving it ends the upload. */
   private readonly stay = (event: BeforeUnloadEvent): void => event.preventDefault();
+
+  /** Ask before the page is left while that ends an upload or loses a recording. */
+  private guard(): void {
+    if (this.sending || this.slots.isUnsaved) addEventListener("beforeunload", this.stay);
+    else removeEventListener("beforeunload", this.stay);
+  }
 
   private busy(busy: boolean): void {
     this.send.disabled = busy;
     this.stop.hidden = !busy;
-    if (busy) addEventListener("beforeunload", this.stay);
-    else removeEventListener("beforeunload", this.stay);
+    this.guard();
   }
 
   /** Show an error; `outcome` is what has become of the files, and `again` is called when the user has chosen one of several interpretations. */

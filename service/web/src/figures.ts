@@ -1,6 +1,7 @@
 // The key figures of a job.
 
 import { fill, h } from "./dom";
+import { expectedSeconds } from "./sent";
 import { type Job, isFinal } from "./types";
 import { duration, inTracksUnit, ofSize } from "./words";
 
@@ -24,10 +25,13 @@ function figures(job: Job): [string, string][] {
   if (error !== undefined) rows.push(["3-D error", `${ofSize(error)}, measured against the ground truth`]);
   if (residual !== undefined) rows.push(["Reprojection", inTracksUnit(residual, job)]);
   if (job.started_at && job.finished_at) rows.push(["Duration", duration((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)]);
+  if (isFinal(job.status)) return rows;
   const { progress } = job;
-  if (progress && !isFinal(job.status)) {
-    if (progress.residual !== null) rows.push(["Residual", inTracksUnit(progress.residual, job)]);
-    rows.push(["Time left", progress.seconds_left === null ? "–" : duration(progress.seconds_left)]);
-  }
+  const expected = expectedSeconds(job);
+  const left = progress?.seconds_left ?? null;
+  if (progress !== null && progress.residual !== null) rows.push(["Residual", inTracksUnit(progress.residual, job)]);
+  // Until the remaining time is known: two estimates may contradict each other.
+  if (left === null && expected !== null) rows.push(["Expected time", duration(expected)]);
+  else if (progress) rows.push(["Time left", left === null ? "–" : duration(left)]);
   return rows;
 }

@@ -1,6 +1,7 @@
 // The film section of the form: advice, a frame, and the region: drawn on that frame, or a mask picture.
 
 import { fill, button, h } from "./dom";
+import { keepRegion, keptRegion, mark } from "./draft";
 import { RegionDialog } from "./draw";
 import { firstFrame } from "./film";
 import { openFrames } from "./frames";
@@ -15,11 +16,12 @@ const UNDECODED =
 /** Longest side of the small picture, in its own pixels. */
 const SIDE = 640;
 
-/** A region drawn on a frame, which is counted from 0. `picture` is that frame, or null for the first one. */
+/** A region drawn on a frame, which is counted from 0. `picture` is that frame; null for the first one, and for a restored region until it is decoded. */
 interface Drawn {
   region: Region;
   frame: number;
   picture: ImageBitmap | null;
+  isRestored?: boolean;
 }
 
 export class Filming {
@@ -37,6 +39,8 @@ export class Filming {
     h("div", { class: "row" }, this.draw, button("Choose a mask picture", () => this.masks.click()), this.masks, this.clear),
   );
   private film: File | null = null;
+  /** What the film is recognised by when it is chosen again; null: nothing. */
+  private mark: string | null = null;
   private picture: ImageBitmap | null = null;
   /** The first frame as the service decoded it, while the browser may still be decoding the film. */
   private served: ImageBitmap | null = null;
@@ -71,8 +75,15 @@ export class Filming {
     return this.masking?.file ?? null;
   }
 
-  /** Show another film, or none. */
-  show(film: File | null): void {
+  /** Show another film, or none; ends before the first frame is decoded, with the region that was drawn on this film before a reload. */
+  async show(film: File | null): Promise<void> {
+    this.film = film;
+    this.release();
+    const known = film && (await mark(film));
+    if (this.film !== film) return;
+    this.mark = known;
+    const kept = known === null ? null : keptRegion(known);
+    this.drawn = kept && { ...kept, picture: null, isRestored: true };
     this.shown = this.begin(film);
   }
 
@@ -85,6 +96,7 @@ export class Filming {
   /** Use a mask picture for the first frame instead of a drawn region. */
   async useMask(file: File): Promise<void> {
     this.release();
+    this.keep();
     const masking: Filming["masking"] = { file, picture: null };
     this.masking = masking;
     const picture = await createImageBitmap(file).catch(() => null); // the service will report the error
@@ -118,10 +130,8 @@ export class Filming {
   }
 
   private async begin(film: File | null): Promise<void> {
-    this.film = film;
     this.picture?.close();
     this.served?.close();
-    this.release();
     this.picture = this.served = null;
     this.frames = new Promise((resolve) => (this.tellFrames = resolve));
     this.undecoded = false;
@@ -146,11 +156,29 @@ export class Filming {
     }
     this.served = null;
     this.update();
+    if (this.film && this.isElsewhere) void this.findFrame(this.film);
+  }
+
+  /** Whether the region was drawn on a frame that is not decoded, other than the first. */
+  private get isElsewhere(): boolean {
+    return this.drawn !== null && this.drawn.frame > 0 && this.drawn.picture === null;
+  }
+
+  /** Decode the frame that a restored region was drawn on, once the service has counted the frames. */
+  private async findFrame(film: File): Promise<void> {
+    const { drawn } = this;
+    const frames = this.undecoded ? null : await openFrames(film, this.frames);
+    const picture = (await frames?.picture(drawn?.frame ?? 0).catch(() => null)) ?? null;
+    frames?.close();
+    if (drawn === null || this.drawn !== drawn || picture === null) return picture?.close();
+    this.drawn = { ...drawn, picture };
+    this.update();
   }
 
   private edit(): void {
-    const { film, picture, drawn } = this;
+    const { film, picture } = this;
     if (film === null || picture === null) return;
+    const drawn = this.isElsewhere ? null : this.drawn; // a region fits its own frame only
     const given = { region: drawn?.region ?? null, frame: drawn?.frame ?? 0, picture: drawn?.picture ?? picture };
     const frames = this.undecoded ? Promise.resolve(null) : openFrames(film, this.frames);
     new RegionDialog(given, frames, (done) => this.choose({ ...done, picture: done.picture === this.picture ? null : done.picture })).open();
@@ -169,8 +197,13 @@ export class Filming {
   private choose(drawn: Drawn | null): void {
     this.release(drawn?.picture);
     this.drawn = drawn;
+    this.keep();
     this.update();
     this.onChange();
+  }
+
+  private keep(): void {
+    if (this.film && this.mark !== null) keepRegion(this.mark, this.film.name, this.drawn);
   }
 
   /** Forget the region, except a picture that is still used. */
@@ -182,17 +215,20 @@ export class Filming {
 
   private update(): void {
     const { drawn, mask } = this;
+    const frame = drawn && drawn.frame > 0 ? ` Drawn on frame ${drawn.frame}.` : "";
+    const restored = drawn?.isRestored ? " Restored: you drew it on this film before." : "";
     if (mask) this.write(`Region of the first frame: the mask picture ${mask.name}. What is white in it is tracked.`);
-    else if (this.picture) this.write(`${described(drawn?.region ?? null)}${drawn && drawn.frame > 0 ? ` Drawn on frame ${drawn.frame}.` : ""}`);
+    else if (this.picture || drawn) this.write(`${described(drawn?.region ?? null)}${frame}${restored}`);
     else this.write(this.undecoded ? UNDECODED : "Reading the first frame…");
   }
 
   private write(words: string): void {
-    const { drawn, masking } = this;
+    const { masking } = this;
+    const drawn = this.isElsewhere ? null : this.drawn;
     const picture = drawn?.picture ?? this.picture;
     fill(this.words, words, () => [words]);
     this.canvas.hidden = this.draw.hidden = picture === null;
-    this.clear.hidden = drawn === null && masking === null;
+    this.clear.hidden = this.drawn === null && masking === null;
     this.draw.textContent = drawn ? "Change the region" : "Draw a region";
     this.canvas.setAttribute("aria-label", drawn && drawn.frame > 0 ? `Frame ${drawn.frame} of the film` : "First frame of the film");
     if (picture === null) return;

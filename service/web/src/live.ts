@@ -30,17 +30,20 @@ export class LiveTracks {
   show(job: Job): void {
     const { status, progress } = job;
     const pending = ofFilm(job) && (status === "queued" || status === "running");
-    this.element.hidden = !pending;
+    const followed = progress?.followed ?? null;
+    const isTracked = progress !== null && progress.stage !== "track";
+    // After a reload, nothing is left to show of a film that is tracked already.
+    this.element.hidden = !pending || (isTracked && !followed && !this.followed && sentFile(this.id, "film") === undefined);
     if (!pending) return this.close();
     if (!this.started) {
       this.started = true;
       void this.begin();
     }
-    const followed = progress?.followed ?? null;
     if (followed && followed.frame !== this.followed?.frame) this.move(followed);
     const count = this.followed ? this.followed.points.length / 2 : 0;
     const still = this.still ? " The picture stays at the first frame: this browser cannot decode the film." : "";
-    say(this.words, count > 0 ? `Frame ${this.followed?.frame}: ${count} of the tracked points.${still}` : "The points appear as soon as they are tracked.");
+    const expected = isTracked ? "The film is tracked." : "The points appear as soon as they are tracked.";
+    say(this.words, count > 0 ? `Frame ${this.followed?.frame}: ${count} of the tracked points.${still}` : expected);
   }
 
   close(): void {

@@ -1,7 +1,7 @@
 // The form for a job's options, built from the service's schema: new options appear automatically.
 
 import { h, uniqueId } from "./dom";
-import type { Job, Options, Schema } from "./types";
+import { type Interpretation, type Job, type Options, type Schema, ofFilm } from "./types";
 
 /** Not in the form: the region is drawn on a frame of the film. */
 const DRAWN = ["region_polygon", "region_frame"];
@@ -154,9 +154,22 @@ export function chosen({ options, interpretation }: Job): Options {
   return Object.fromEntries(Object.entries(options).filter(([name, value]) => !(name in stated && value === stated[name])));
 }
 
+/** Options whose value an input may state itself. */
+const STATED = ["fps", "image_size"];
+
+/** Return what an input states itself, by option and in words; null: it is a film that is not read yet, and states both. */
+export function statedBy(interpretation: Interpretation | null): Record<string, string> {
+  if (interpretation === null) return Object.fromEntries(STATED.map((name) => [name, "the film's"]));
+  const { fps, image_size: size } = interpretation;
+  const whose = ofFilm({ interpretation }) ? "the film's" : "the file's";
+  return { ...(fps && { fps: `${Number(fps.toPrecision(4))}, ${whose}` }), ...(size && { image_size: `${size}, ${whose}` }) };
+}
+
 interface Field {
   name: string;
   schema: Schema;
+  /** Not sent: the default, or null while the input states its own value. */
+  base: unknown;
   fold: HTMLDetailsElement;
   answer: HTMLElement;
   element: HTMLElement;
@@ -167,6 +180,7 @@ interface Field {
 export class OptionsForm {
   readonly element = h("div", { class: "folds" });
   private fields: Field[] = [];
+  private stated: Record<string, string> = {};
 
   /** Build the form from the schema. Before that, jobs are submitted with the defaults. */
   load(schema: Schema): void {
@@ -191,14 +205,21 @@ export class OptionsForm {
     return fold;
   }
 
-  /** The options that differ from the defaults. */
+  /** The options that differ from the defaults and from what the input states. */
   values(): Options {
-    const given: Options = {};
-    for (const field of this.fields) {
-      const value = field.read();
-      if (value !== undefined && JSON.stringify(value) !== JSON.stringify(field.schema.default ?? null)) given[field.name] = value;
+    return Object.fromEntries(this.fields.filter(isGiven).map((field) => [field.name, field.read()]));
+  }
+
+  /** Show what the input states itself instead of the defaults, unless the user has chosen something else. */
+  state(stated: Record<string, string>): void {
+    this.stated = stated;
+    for (const field of this.fields.filter(({ name }) => STATED.includes(name))) {
+      const isOpen = !isGiven(field);
+      field.base = field.name in stated ? null : (field.schema.default ?? null);
+      if (isOpen) field.write(field.base);
+      (field.element as HTMLInputElement).placeholder = stated[field.name] ?? (field.base === null ? "automatic" : "");
+      field.fold.dispatchEvent(new Event("change")); // counts again
     }
-    return given;
   }
 
   /** Set one option, for example an interpretation that the service offered. */
@@ -208,9 +229,21 @@ export class OptionsForm {
     field?.element.dispatchEvent(new Event("change", { bubbles: true }));
   }
 
+  /** Fill the form with options that the user chose, the default among them if a film was to have it. */
+  restore(options: Options): void {
+    for (const field of this.fields) if (STATED.includes(field.name) && field.name in options) field.base = null;
+    this.fill(options);
+  }
+
+  /** Set every option to its default, or to what the input states. */
+  reset(): void {
+    this.state(this.stated);
+    this.fill({});
+  }
+
   /** Fill the form with the options of a job. */
   fill(options: Options): void {
-    for (const field of this.fields) field.write(field.name in options ? options[field.name] : (field.schema.default ?? null));
+    for (const field of this.fields) field.write(field.name in options ? options[field.name] : field.base);
     for (const { element } of this.fields) element.dispatchEvent(new Event("change", { bubbles: true }));
   }
 
@@ -238,7 +271,7 @@ export class OptionsForm {
     const id = uniqueId("option");
     const control = controlFor(schema, id);
     const answer = h("div", { class: "slot-answer", "aria-live": "assertive" });
-    this.fields.push({ name, schema, fold, answer, ...control });
+    this.fields.push({ name, schema, base: schema.default ?? null, fold, answer, ...control });
     const hint = h("p", { class: "hint", id: `${id}-hint` }, describe(name, schema, String(control.read() ?? "")));
     control.element.setAttribute("aria-describedby", hint.id);
     control.element.addEventListener("change", () => {
@@ -251,6 +284,12 @@ export class OptionsForm {
     const label = group ? h("span", { title: name }, ...words) : h("label", { for: id, title: name }, ...words);
     return h("div", { class: "option" }, label, control.element, hint, answer);
   }
+}
+
+/** Whether the user has chosen a value. */
+function isGiven({ base, read }: Field): boolean {
+  const value = read();
+  return value !== undefined && JSON.stringify(value) !== JSON.stringify(base);
 }
 
 type Control = Pick<Field, "read" | "write" | "element">;
@@ -318,7 +357,7 @@ function entry(id: string, schema: Schema, nullable: boolean, initial: unknown):
   };
   write(initial);
   const read = (): unknown => {
-    if (element.value === "") return nullable ? null : initial;
+    if (element.value === "") return nullable ? null : undefined;
     return numeric ? Number(element.value) : element.value;
   };
   return { element, read, write };

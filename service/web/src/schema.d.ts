@@ -84,9 +84,14 @@ export interface components {
             memory_bytes: number;
             /**
              * Seconds
-             * @description Processor seconds on one core of a usual machine, without the test for an isometric surface.
+             * @description Processor seconds of the reconstruction on one core of a usual machine, without the test for an isometric surface.
              */
             seconds: number;
+            /**
+             * Tracking Seconds
+             * @description Seconds of tracking a film before, measured on one of its frames; null for tracks.
+             */
+            tracking_seconds: number | null;
         };
         /**
          * Example
@@ -293,7 +298,7 @@ export interface components {
              * @description Sentences with evidence, exclusions and assumptions.
              */
             notes: string[];
-            /** @description Memory and time of the reconstruction; null for films that are not tracked yet, whose points are unknown. */
+            /** @description Memory and time; null for films that are not tracked yet, whose points are unknown: an inspection estimates them. */
             estimate: components["schemas"]["Estimate"] | null;
             /**
              * Sample
@@ -419,7 +424,7 @@ export interface components {
              * @description Sentences with evidence, exclusions and assumptions.
              */
             notes: string[];
-            /** @description Memory and time of the reconstruction; null for films that are not tracked yet, whose points are unknown. */
+            /** @description Memory and time; null for films that are not tracked yet, whose points are unknown: an inspection estimates them. */
             estimate: components["schemas"]["Estimate"] | null;
         };
         /**

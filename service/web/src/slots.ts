@@ -2,6 +2,7 @@
 
 import { CameraDialog, canRecord } from "./camera";
 import { button, h, say, uniqueId } from "./dom";
+import { filmOfRegion } from "./draft";
 import { keepServed, looksLikeFilm, looksLikePicture, looksLikeTracks, servedFrame } from "./film";
 import { Filming } from "./filming";
 import { type Entry, describe, isReadable, peek } from "./peek";
@@ -35,6 +36,8 @@ export class Slots {
   hasFilms = false;
   /** Ends when all given files are read and in their slots. */
   read: Promise<void> = Promise.resolve();
+  /** The last recording of the camera, which exists in this page only; null once it was submitted. */
+  private recorded: File | null = null;
   private readonly slots = new Map<Part, Slot>();
   private readonly filming = new Filming(() => this.onChange());
   private readonly title = h("p", { class: "zone-title" }, "Drop tracks and a mesh here");
@@ -55,6 +58,8 @@ export class Slots {
   acceptFilms(): void {
     this.hasFilms = true;
     this.title.textContent = "Drop a film here, or tracks and a mesh";
+    const [slot, drawn] = [this.slots.get("film"), filmOfRegion()];
+    if (slot && slot.file === null && drawn !== null) slot.contents.textContent = `The region you drew on ${drawn} is kept: choose the film again to use it.`;
     this.arrange();
   }
 
@@ -75,6 +80,16 @@ export class Slots {
 
   file(part: Part): File | null {
     return this.slots.get(part)?.file ?? null;
+  }
+
+  /** Whether the film is a recording that would be lost with the page. */
+  get isUnsaved(): boolean {
+    return this.recorded !== null && this.file("film") === this.recorded;
+  }
+
+  /** The service has the files. */
+  saved(): void {
+    this.recorded = null;
   }
 
   /** The file after which the job is named. */
@@ -226,7 +241,10 @@ export class Slots {
 
   private recording(): HTMLElement | string {
     if (!canRecord()) return "";
-    const film = (recorded: File): void => void this.inTurn(() => this.put("film", recorded));
+    const film = (recorded: File): void => {
+      this.recorded = recorded;
+      void this.inTurn(() => this.put("film", recorded));
+    };
     return h("span", { class: "record" }, button("Record with the camera", () => void new CameraDialog(film).open(), { class: "link" }));
   }
 
@@ -269,7 +287,7 @@ export class Slots {
     if (part === "mesh") (this.grid.parentElement as HTMLElement).hidden = file !== null;
     if (part === "film") {
       this.arrange();
-      this.filming.show(file);
+      await this.filming.show(file);
     }
     if (file === null) {
       slot.input.value = "";

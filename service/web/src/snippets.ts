@@ -2,7 +2,7 @@
 
 import { getOptions } from "./api";
 import { button, fill, h } from "./dom";
-import { chosen } from "./options";
+import { chosen, statedBy } from "./options";
 import { sentNames } from "./sent";
 import { type Job, type Schema, ofFilm } from "./types";
 
@@ -65,10 +65,11 @@ export class Snippets {
 
 type Given = [string, unknown][];
 
-/** The options of a job that differ from the defaults. */
+/** The options of a job that differ from the defaults, or from what its input states itself. */
 function given(job: Job, schema: Schema): Given {
+  const stated = statedBy(job.interpretation);
   const differs = (name: string, value: unknown): boolean => JSON.stringify(value) !== JSON.stringify(schema.properties?.[name]?.default ?? null);
-  return Object.entries(chosen(job)).filter(([name, value]) => differs(name, value));
+  return Object.entries(chosen(job)).filter(([name, value]) => name in stated || differs(name, value));
 }
 
 interface FormPart {

@@ -53,6 +53,6 @@ export function isFinal(status: Status): boolean {
 }
 
 /** Whether a job was submitted as a film. A file of `pliant track` has the film's mesh, too, but contains tracks. */
-export function ofFilm(job: Job): boolean {
-  return job.interpretation.format.startsWith("film (");
+export function ofFilm({ interpretation }: Pick<Job, "interpretation">): boolean {
+  return interpretation.format.startsWith("film (");
 }

@@ -3,8 +3,8 @@
 import { Refusal, inspect } from "./api";
 import { button, fill, h } from "./dom";
 import { Glimpse } from "./glimpse";
-import type { Inspection as InspectionAnswer, Interpretation, Job } from "./types";
-import { bytes, count, percent } from "./words";
+import type { Inspection as InspectionAnswer, Interpretation, Job, Options } from "./types";
+import { bytes, count, expected, percent } from "./words";
 
 const MESHES: Record<string, string> = {
   given: "as given",
@@ -141,11 +141,12 @@ export class Inspection {
     this.clear();
     const asking = new AbortController();
     this.asking = asking;
-    this.words.textContent = "Reading…";
+    this.words.textContent = "Sending and reading the files…";
     try {
       const seen = await inspect(form, asking.signal);
       if (asking.signal.aborted) return;
-      this.facts.show(facts(seen), notesOf(seen));
+      const time = expected(seen, JSON.parse(String(form.get("options"))) as Options);
+      this.facts.show([...facts(seen), ...(time ? [["Time", time] as [string, string]] : [])], notesOf(seen));
       this.found.hidden = false;
       this.glimpse.show(seen.sample ?? []);
       this.onSeen(seen);

@@ -1,6 +1,6 @@
 // Numbers, sizes, times and names for display.
 
-import type { Job, Status } from "./types";
+import type { Interpretation, Job, Options, Status } from "./types";
 
 const whole = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 
@@ -62,6 +62,14 @@ function seconds(value: number): string {
   if (value < 90) return count(Math.round(value), "second");
   if (value < 5400) return count(Math.round(value / 60), "minute");
   return `${(value / 3600).toFixed(1)} hours`;
+}
+
+/** How long a job with these inputs and options takes; null: no estimate. The test for a sheet is not in it, as only the tracks show whether it is needed. */
+export function expected({ estimate, image_size, has_rotations }: Interpretation, options: Options): string | null {
+  if (!estimate) return null;
+  const time = `about ${seconds(estimate.seconds + (estimate.tracking_seconds ?? 0))} once it runs`;
+  const isTested = !has_rotations && !options["surface"] && (image_size || options["image_size"] || options["focal"] || options["field_of_view"]);
+  return isTested ? `${time}. The test for a sheet such as paper can add half a minute; Surface: free omits it.` : time;
 }
 
 /** The same, abbreviated for a heading. */

@@ -9,7 +9,7 @@ import cv2
 import httpx
 import numpy as np
 import pytest
-from browsing import NEEDS_CHROMIUM
+from browsing import NEEDS_CHROMIUM, heard
 from filming import (
     BLUE,
     HEIGHT,
@@ -120,6 +120,49 @@ def test_the_rate_and_size_that_a_film_states_are_not_options_of_the_next_job(
     until(lambda: filming.evaluate("window.sent !== undefined"))
     assert sent_options(filming)["frames"] == "::2"
     assert not stated.keys() & sent_options(filming).keys()
+
+
+def test_the_form_shows_the_rate_and_size_of_the_film_instead_of_the_defaults(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
+    """Until the service has read the film, they are unknown; the default rate of tracks can still be chosen for a film."""
+    asked: list[Route] = []
+    filming.route("**/v1/inspect", lambda route: asked.append(route))
+    filming.locator(".folds summary", has_text="Files to write").click()
+    filming.locator(".folds summary", has_text="Lens").click()
+    rate, size = filming.get_by_label("Frame rate"), filming.get_by_label("Picture size")
+    expect(rate).to_have_value("25")
+    drop(filming, {"film.webm": films["film.webm"]})
+    expect(rate).to_have_attribute("placeholder", "the film's")
+    expect(rate).to_have_value("")
+    heard(filming, lambda: asked != [])
+    stated = {"fps": 30000 / 1001, "image_size": "320x240"}
+    seen = {**film_record(url, finished)["interpretation"], **stated, "sample": []}
+    asked[0].fulfill(json=seen)
+    expect(rate).to_have_attribute("placeholder", "29.97, the film's")
+    expect(size).to_have_attribute("placeholder", "320x240, the film's")
+    filming.get_by_role("button", name="Remove film").click()
+    expect(rate).to_have_value("25")
+    expect(size).to_have_attribute("placeholder", "automatic")
+
+    filming.route("**/v1/inspect", lambda route: route.fulfill(json=seen))
+    record = film_record(url, finished)
+    record["options"] |= {**stated, "fps": 25.0}
+    record["interpretation"] |= stated
+    answer_with(filming, record)
+    drop(filming, {"film.webm": films["film.webm"]})
+    expect(rate).to_have_attribute("placeholder", "29.97, the film's")
+    expect(filming.get_by_text("(1 changed)")).to_be_hidden()
+    rate.fill("25")
+    rate.press("Tab")
+    expect(filming.get_by_text("(1 changed)")).to_be_visible()
+    filming.get_by_role("button", name="Reconstruct").click()
+    expect(filming.get_by_role("region", name="Use from code")).to_contain_text('"fps": 25}')
+    assert sent_options(filming) == {"fps": 25}
+    filming.get_by_text("New reconstruction").click()
+    drop(filming, {"tracks.npz": packed(tracks=np.zeros((3, 4, 2)))})
+    expect(rate).to_have_value("25")
+    expect(filming.get_by_text("(1 changed)")).to_be_hidden()
 
 
 def test_a_film_that_the_browser_cannot_show_is_sent_without_a_region(
@@ -312,3 +355,59 @@ def test_tracks_of_a_film_are_not_taken_for_a_film(filming: Page, url: str, fini
     expect(filming.get_by_role("region", name="Use from code")).to_contain_text('submit(\n    "tracks.npz"')
     expect(filming.get_by_role("button", name="Cancel")).to_be_visible()
     expect(filming.get_by_text("The points appear as soon as they are tracked.")).to_be_hidden()
+
+
+def test_the_expected_time_is_shown_until_the_remaining_time_is_known(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
+    """The record of a film's job has no estimate: the page keeps that of the check of its files."""
+    estimate = {"memory_bytes": 2 * 10**8, "seconds": 20.0, "tracking_seconds": 100.0}
+    stated = {"image_size": "320x240", "has_rotations": False}
+    record = film_record(url, finished, status="queued", progress=None, place_in_queue=1)
+    record["interpretation"] |= stated
+    seen = {**record["interpretation"], "sample": [], "estimate": estimate}
+    filming.route("**/v1/inspect", lambda route: route.fulfill(json=seen))
+    answer_with(filming, record)
+    drop(filming, {"film.webm": films["film.webm"]})
+    found = filming.get_by_role("region", name="How your files are interpreted")
+    sheet = "The test for a sheet such as paper can add half a minute; Surface: free omits it."
+    expect(found).to_contain_text(f"Timeabout 2 minutes once it runs. {sheet}")
+    filming.locator(".folds summary", has_text="Surface and smoothness").click()
+    filming.get_by_label("Surface", exact=True).select_option(label="free")
+    expect(found).to_contain_text("about 2 minutes once it runs")
+    expect(found).not_to_contain_text("sheet")
+
+    filming.get_by_role("button", name="Reconstruct").click()
+    figures = filming.locator(".figures")
+    expect(figures).to_have_text("Frames6Expected time2:00 min")
+    progress = film_record(url, finished)["progress"]
+    record |= {"status": "running", "progress": {**progress, "seconds_left": None}}
+    filming.reload()
+    expect(filming.get_by_text("Tracking the film.")).to_be_visible()
+    expect(figures).to_have_text("Frames6Expected time2:00 min")
+    record["progress"] = {**progress, "updated_at": "2100-01-01T00:00:00Z"}
+    expect(figures).to_have_text(re.compile(r"Frames6Time left\d\d s"))
+
+
+def test_the_expected_time_of_tracks_is_that_of_their_record(filming: Page, url: str, finished: str) -> None:
+    """But not where a job only writes further files of a result."""
+    estimate = {"memory_bytes": 2 * 10**8, "seconds": 20.0, "tracking_seconds": None}
+    record = film_record(url, finished, status="queued", progress=None, place_in_queue=1)
+    record["interpretation"] |= {"num_points": 300, "format": "unnamed", "estimate": estimate}
+    answer_with(filming, record)
+    filming.goto(f"{url}/#job={finished}")
+    figures = filming.locator(".figures")
+    expect(figures).to_have_text("Frames6Points300Expected time20 s")
+    record["outputs_of"] = "f" * 32
+    filming.reload()
+    expect(figures).to_have_text("Frames6Points300")
+
+
+def test_the_picture_of_a_film_is_no_higher_than_the_screen(filming: Page, films: dict[str, bytes]) -> None:
+    """On a phone held sideways, the form is as wide as the screen."""
+    filming.set_viewport_size({"width": 844, "height": 390})
+    drop(filming, {"film.webm": films["film.webm"]})
+    box = filming.get_by_role("img", name="First frame of the film").bounding_box()
+    assert box is not None
+    assert 200 < box["height"] < 0.6 * 390
+    assert box["width"] / box["height"] == pytest.approx(WIDTH / HEIGHT, rel=0.02)

@@ -362,6 +362,27 @@ def test_a_distant_principal_point_is_rejected() -> None:
     assert (refused.value.code, refused.value.field) == ("principal_point_far", "options.principal_point")
 
 
+def test_a_distant_principal_point_of_given_cameras_is_named_as_theirs() -> None:
+    known = KnownCamera.from_arrays(FACE.rotations, principal_point=(1e7, 0.0))
+    with pytest.raises(InvalidInput) as refused:
+        given_lens(normalize(pinhole(SEEN, FOCAL)), Settings(principal_point=tuple(CENTRE)), known)
+    assert (refused.value.code, refused.value.field) == ("principal_point_far", "cameras.principal_point")
+
+
+@pytest.mark.parametrize("size", [None, (1920.0, 1080.0)])
+def test_perspective_is_not_considered_for_an_object_that_is_small_beside_its_distance_from_the_centre(
+    size: Any,
+) -> None:
+    across = np.linspace(0, 1800, len(SEEN))[:, None, None] * [1, 0]
+    small = normalize(Tracks.from_arrays(20 + SEEN[..., :2] / 100 + across))
+    assert given_lens(small, Settings(image_size=size)) is None
+    field = "tracks" if size is None else "options.image_size"
+    for settings in (Settings(image_size=size, camera="perspective"), Settings(image_size=size, focal=2000.0)):
+        with pytest.raises(InvalidInput, match="Choose camera scaled_orthographic") as refused:
+            given_lens(small, settings)
+        assert (refused.value.code, refused.value.field) == ("principal_point_far", field)
+
+
 def test_fractions_of_the_picture_with_its_size_in_pixels_are_rejected() -> None:
     tracks = pinhole(SEEN, FOCAL)
     fractions = Tracks.from_arrays(tracks.points / np.array(PICTURE), tracks.visible)

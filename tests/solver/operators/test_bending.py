@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pliant.solver import Mesh
 from pliant.solver.energy.hyperparameters import bending_weight
 from pliant.solver.operators import bending
 from pliant.solver.operators.bending import add_bending, bends_of, frames_together
@@ -32,6 +33,11 @@ def test_rounding_to_the_current_precision_changes_nothing() -> None:
     assert laplacian is not None
     assert laplacian.rounded(np.dtype(np.float64)) is laplacian
     assert laplacian.matrix.indices.dtype == np.int32
+
+
+@pytest.mark.parametrize("kind", ["uniform", "cotangent"])
+def test_a_grid_of_one_row_has_no_faces_and_thus_no_laplacian_of_faces(kind: str) -> None:
+    assert build_laplacian(Mesh.from_grid(np.arange(5)[None]), kind, np.ones((5, 3))) is None
 
 
 def test_faces_whose_corners_coincide_get_the_smallest_cotangent_weight() -> None:

@@ -129,7 +129,8 @@ def test_where_depths_diverge_at_the_given_focal_length_the_cameras_are_orthogra
     assert solution.choices.camera == "scaled_orthographic"
     assert "is impossible, because the depths of the points diverge" in solution.choices.reasons["camera_model"]
     (warning,) = (each for each in solution.choices.warnings if "focal length" in each)
-    assert warning == "The given focal length, 390, is improbable: the depths of the points diverge with it."
+    improbable = "The given focal length, 390, is improbable: the depths of the points diverge with it"
+    assert warning == f"{improbable}, so the cameras are orthographic."
     assert solution.trust is not None
     assert solution.trust.verdict != "good"
 

@@ -53,3 +53,14 @@ def test_coincident_points_are_rejected() -> None:
     with pytest.raises(InvalidInput, match="points that differ") as caught:
         normalize(Tracks.from_arrays(np.full((3, 5, 2), 7.0)))
     assert caught.value.code == "no_extent"
+
+
+def test_frames_that_mostly_show_one_point_have_the_extent_of_the_others() -> None:
+    points = np.random.default_rng(0).normal(size=(9, 4, 2))
+    visible = np.zeros((9, 4))
+    visible[:7, 0] = 1  # each is its frame's median: the median radius is 0
+    visible[7:] = 1
+    found = normalize(Tracks.from_arrays(points, visible))
+    np.testing.assert_allclose(
+        found.unit, normalize(Tracks.from_arrays(np.concatenate([points[7:]] * 2))).unit * (8 / 15) ** 0.5
+    )

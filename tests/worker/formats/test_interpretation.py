@@ -169,6 +169,14 @@ def test_a_matrix_whose_x_and_y_are_the_same_in_every_layout_is_ambiguous() -> N
     assert all("the same coordinate" in each["evidence"] for each in error.choices)
 
 
+def test_a_frame_without_y_is_hidden(tmp_path: Path) -> None:
+    points = POINTS.copy()
+    points[2, :, 1] = np.nan
+    np.testing.assert_array_equal(
+        read(tmp_path, {"tracks": points}, coordinates="pixels").tracks.visible.any(axis=1), np.arange(F) != 2
+    )
+
+
 def test_occlusion_that_is_not_finite_counts_as_hidden() -> None:
     occluded = np.zeros(POINTS.shape[:2])
     occluded[2, 1], occluded[3, 0] = np.nan, 1.0

@@ -288,6 +288,6 @@ def test_visibility_larger_than_the_tracks_is_refused_before_conversion(
 def test_tracks_with_all_points_in_one_position_are_refused(tmp_path: Path, where: float) -> None:
     points = np.full((6, 20, 2), where) + np.arange(6)[:, None, None]
     np.savez(tmp_path / "t.npz", tracks=points)
-    with pytest.raises(InvalidInput, match="one position for all points") as caught:
+    with pytest.raises(InvalidInput, match="one position for all visible points") as caught:
         read_inputs(tracks=tmp_path / "t.npz", mesh="none", options=Options())
     assert caught.value.code == "no_extent"

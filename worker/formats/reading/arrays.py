@@ -7,11 +7,13 @@ declares are read, into memory that the system allocates as it is filled.
 
 from __future__ import annotations
 
+import ast
 import errno
 import math
 import os
 import re
 import struct
+import threading
 import zipfile
 import zlib
 from collections.abc import Collection
@@ -32,14 +34,8 @@ MAX_DIMENSIONS = 8
 MAX_DIRECTORY = 1 << 20
 CHUNK = 1 << 20
 MEMBER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,120}\.npy")
-_ENTRY = re.compile(
-    r"""(['"])(?P<name>\w+)\1 \s*:\s*
-    (?: (['"])(?P<text>[^'"\\]*)\3 | (?P<bool>True|False) | \((?P<tuple>[^()]*)\) | (?P<list>\[.*\]) )
-    \s*(?:,\s*|\Z)""",
-    re.VERBOSE | re.DOTALL,
-)
-"""An entry of a NumPy header; the list is that of a structured type."""
-_WHOLE = re.compile(r"\s*-?(?:0|[1-9]\d*)\s*", re.ASCII)
+_ONE_AT_A_TIME = threading.Lock()
+"""Python 3.11's parser of literals now and then raises SystemError while several threads use it."""
 UNREADABLE_ZIP = (
     zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, OSError, OverflowError, struct.error, UnicodeDecodeError,
 )  # fmt: skip
@@ -268,40 +264,14 @@ def read_file(
 
 
 def _header_dictionary(text: bytes, field: str) -> dict[str, object]:
-    """Return the entries of a header: texts, bools and tuples, of which only tuples of whole numbers are read.
-
-    Python's own parser of literals is not used: in Python 3.11, it fails now and then with a SystemError while several threads use it.
-    """
-    no_dictionary = "a NumPy header that is not a dictionary of descr, fortran_order and shape"
     try:
-        literal = text.decode("utf-8").strip()
-    except UnicodeDecodeError as error:
-        raise damaged(field, no_dictionary) from error
-    if not (literal.startswith("{") and literal.endswith("}")):
-        raise damaged(field, no_dictionary)
-    inside, place, described = literal[1:-1].strip(), 0, dict[str, object]()
-    while place < len(inside):
-        entry = _ENTRY.match(inside, place)
-        if entry is None:
-            raise damaged(field, no_dictionary)
-        described[entry["name"]] = _value(entry)
-        place = entry.end()
-    if set(described) != {"descr", "fortran_order", "shape"}:
-        raise damaged(field, no_dictionary)
+        with _ONE_AT_A_TIME:
+            described = ast.literal_eval(text.decode("utf-8"))
+    except (ValueError, SyntaxError, MemoryError, RecursionError) as error:
+        raise damaged(field, "a NumPy header that is not a Python dictionary") from error
+    if not isinstance(described, dict) or set(described) != {"descr", "fortran_order", "shape"}:
+        raise damaged(field, "a NumPy header with other entries than descr, fortran_order and shape")
     return described
-
-
-def _value(entry: re.Match[str]) -> object:
-    if entry["bool"] is not None:
-        return entry["bool"] == "True"
-    if entry["tuple"] is None:
-        return entry["list"] if entry["text"] is None else entry["text"]
-    numbers = entry["tuple"].split(",")
-    if len(numbers) == 1 and numbers[0].strip():
-        return None  # parentheses around one number make no tuple
-    if numbers[-1].strip() == "":  # after the last comma, or of ()
-        numbers.pop()
-    return tuple(int(each) if _WHOLE.fullmatch(each) else each for each in numbers)
 
 
 def _checked(described: dict[str, object], field: str, limits: Limits, *, texts: bool) -> Header:

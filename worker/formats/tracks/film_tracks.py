@@ -72,7 +72,10 @@ def read_film_tracks(path: Path, *, field: str, shape: tuple[int, int], limits: 
     )
     missing = [name for name in REQUIRED if name not in arrays]
     if missing:
-        raise damaged(field, f"tracks of a film without {', '.join(missing)}")
+        raise InvalidInput(
+            "damaged_file", field=field, expected="all arrays that pliant track writes, because there is one named frame_indices",
+            got=f"a file without {', '.join(missing)}", hint="Write the file again, or rename frame_indices if another program wrote it.",
+        )  # fmt: skip
     for name in ("visibility", "confidence"):
         if arrays[name].shape != shape or arrays[name].dtype.kind not in "bfiu":
             raise damaged(field, f"{name} of shape {arrays[name].shape} beside tracks of shape {(*shape, 2)}")

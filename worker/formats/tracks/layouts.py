@@ -111,7 +111,7 @@ def roughness(
         step = _step(sample)
         centred = sample - np.nanmean(sample, axis=(0, 1))
         x, y = centred[..., 0], centred[..., 1]
-        usable = np.isfinite(x).sum(axis=1) >= MIN_POINTS
+        usable = np.isfinite(sample).all(axis=2).sum(axis=1) >= MIN_POINTS
         x, y = (
             x[usable] - np.nanmean(x[usable], axis=1, keepdims=True),
             y[usable] - np.nanmean(y[usable], axis=1, keepdims=True),

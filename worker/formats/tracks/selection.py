@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Mesh
+from pliant.solver.agreement import check_seen
 from pliant.solver.records import MIN_FRAMES
 
 LISTED_POINTS = 10
@@ -60,7 +61,7 @@ def hide_sparsely_observed(
     Raises
     ------
     InvalidInput
-        Code nothing_visible, if no point remains.
+        Code nothing_visible, if no point remains; too_little_seen, if none would with any `min_seen`.
     """
     confidence = np.ones(points.shape[:2]) if visible is None else np.array(visible, dtype=np.float64)
     confidence[~np.isfinite(points).all(axis=2)] = 0.0
@@ -68,6 +69,7 @@ def hide_sparsely_observed(
     if len(dropped) == 0:
         return confidence, dropped, []
     if len(dropped) == points.shape[1] and confidence.any() and len(points) >= MIN_FRAMES:
+        check_seen(confidence)
         raise InvalidInput(
             "nothing_visible", field="options.min_seen", expected=f"points that are visible in {options.min_seen} or more frames",
             got=f"none of {len(dropped)}", hint="Set min_seen lower.",

@@ -98,13 +98,17 @@ def _check_number(name: str, array: NDArray[np.generic], reading: Reading) -> No
     """
     frames, points = reading.points.shape[:2]
     if array.size > 2 * frames * points:
-        raise _wrong_shape(name, array, (frames, points))
+        raise _wrong_shape(name, array, reading)
 
 
-def _wrong_shape(name: str, array: NDArray[np.generic], like: tuple[int, ...]) -> InvalidInput:
+def _wrong_shape(name: str, array: NDArray[np.generic], reading: Reading) -> InvalidInput:
+    """Return the error for an array as it is in the file, where the axes of visibility are in the order of the tracks'."""
+    frames, points = reading.points.shape[:2]
+    turned = reading.order == "points_frames"
+    like, axes = ((points, frames), "(points, frames)") if turned else ((frames, points), "(frames, points)")
     return InvalidInput(
         "wrong_shape", field=f"tracks.{name}", expected=f"{like}, one value for each observation", got=str(array.shape),
-        hint="Visibility is (frames, points), in the order of the tracks.",
+        hint=f"Visibility is {axes}, in the order of the tracks.",
     )  # fmt: skip
 
 
@@ -167,7 +171,7 @@ def _guessed(name: str, finite: NDArray[np.float64], low: float, high: float) ->
 
 
 def _arranged(flat: NDArray[np.float64], reading: Reading, name: str) -> NDArray[np.float64]:
-    like = reading.points.shape[:2]
+    like, given = reading.points.shape[:2], flat
     if flat.ndim == 2 and reading.order == "points_frames":
         flat = flat.T
     if flat.shape == like:
@@ -179,4 +183,4 @@ def _arranged(flat: NDArray[np.float64], reading: Reading, name: str) -> NDArray
             else flat.reshape(2, like[0], like[1]).swapaxes(0, 1)
         )
         return np.ascontiguousarray(pairs.min(axis=1))
-    raise _wrong_shape(name, flat, like)
+    raise _wrong_shape(name, given, reading)
