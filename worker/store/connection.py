@@ -10,6 +10,7 @@ from typing import Any
 import redis
 from pliant.worker.errors import JOB_STORE, InvalidSetting, StoreForbidden, StoreUnavailable
 from pliant.worker.store.calls import SilentServer
+from pliant.worker.store.permissions import check_permissions
 from redis.backoff import ExponentialWithJitterBackoff
 from redis.client import Pipeline
 from redis.retry import Retry
@@ -87,7 +88,7 @@ def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | 
 
 
 def check_server(url: str, *, queue: str) -> str:
-    """Check access to the keys of an installation with the password in the URL; return the server's `maxmemory-policy`.
+    """Check the password in the URL and what its user may do for an installation; return the server's `maxmemory-policy`.
 
     It is empty if it is not readable.
 
@@ -101,13 +102,13 @@ def check_server(url: str, *, queue: str) -> str:
     client = connect(url, decode=True, retries=0, answer_within=3.0)
     try:
         with reachable():
-            client.get(f"{queue}:doctor")
+            check_permissions(client, queue)
             try:
                 found: dict[str, str] = client.config_get("maxmemory-policy")  # type: ignore[assignment]
             except redis.ResponseError:  # managed servers hide their configuration
                 return ""
             return found.get("maxmemory-policy", "")
-    except redis.ResponseError as error:  # a required password is missing, or the user lacks permission
+    except redis.ResponseError as error:  # for example of a server that runs no scripts
         raise StoreUnavailable(JOB_STORE, reason=str(error)[:200]) from error
     finally:
         client.close()

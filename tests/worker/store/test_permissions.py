@@ -19,7 +19,7 @@ from pliant.worker.jobs.service import Jobs
 from pliant.worker.processes.valkey import Valkey
 from pliant.worker.settings import Settings
 from pliant.worker.store import permissions
-from pliant.worker.store.connection import connect
+from pliant.worker.store.connection import check_server, connect
 from worker_house import House, settled
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
@@ -99,6 +99,16 @@ def test_without_scripts_the_command_is_named(settings: Settings, grant: Grant) 
     grant(*ALL, "-evalsha")
     with pytest.raises(StoreForbidden, match=r"forbid the command EVALSHA.*the operator must grant the permission"):
         Jobs.open(settings).page()
+
+
+def test_the_doctor_checks_permissions(settings: Settings, grant: Grant) -> None:
+    grant(*ALL)
+    assert check_server(settings.redis, queue=settings.queue) == "noeviction"
+    grant(*ALL, "-config")
+    assert check_server(settings.redis, queue=settings.queue) == "", "it is not needed"
+    grant(*ALL, "-xadd", "-hincrby")
+    with pytest.raises(StoreForbidden, match="forbid the commands HINCRBY, XADD"):
+        check_server(settings.redis, queue=settings.queue)
 
 
 def test_each_checked_command_has_a_valid_number_of_arguments(valkey_data: Path) -> None:
