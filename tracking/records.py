@@ -78,7 +78,10 @@ class FilmInfo:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedFilm:
-    """Dense tracks of a film, in the film's own pixels: x right, y down, the first pixel's centre at (0, 0)."""
+    """Dense tracks of a film, in the film's own pixels: x right, y down, the first pixel's centre at (0, 0).
+
+    Tracks, visibility and confidence lie in temporary files, which are deleted with the arrays.
+    """
 
     film: FilmInfo
     tracks: NDArray[np.float32]
