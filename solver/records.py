@@ -251,8 +251,8 @@ class KnownCamera:
                     "cameras.focal",
                     "out_of_range",
                     "a positive, finite length",
-                    str(focal),
-                    "Give it in the tracks' unit.",
+                    str(focal) if length.shape == () else f"an array of shape {shape_text(length)}",
+                    "Give one length for all frames, in the tracks' unit.",
                 )
         if principal_point is not None:
             point = np.asarray(numeric(principal_point, "cameras.principal_point", "Give x and y."), dtype=np.float64)

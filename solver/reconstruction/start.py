@@ -284,7 +284,8 @@ def _without_outliers(start: Start, monitor: Monitor) -> Start:
             estimate.projections,
             estimate.translations, covariance, filling, share=start.outlier_share, should_stop=monitor,
         )  # fmt: skip
-        without = replace(problem, confidence=np.where(found, 0, problem.confidence).astype(problem.confidence.dtype))
+        kept = np.where(found, 0, problem.confidence).astype(problem.confidence.dtype)
+        without = replace(problem, confidence=kept) if kept.any() else problem
         start = replace(start, problem=without, state=init(without, start.state.shapes, start.state.translations))
     seen = int(np.count_nonzero(start.observations.tracks.visible))
     reason = outlier_reason(seen - int(np.count_nonzero(start.confidence())), seen, start.outlier_share)

@@ -206,6 +206,13 @@ class TestKnownCamera:
         error = refusal(KnownCamera.from_arrays, np.tile(np.eye(3), (4, 1, 1)), focal=focal)
         assert (error.code, error.field) == ("wrong_type" if focal == "12" else "out_of_range", "cameras.focal")
 
+    def test_a_focal_length_for_each_frame_is_named_by_its_shape(self) -> None:
+        error = refusal(KnownCamera.from_arrays, np.tile(np.eye(3), (4, 1, 1)), focal=np.full(4, 900.0))
+        assert (error.got, error.hint) == (
+            "an array of shape (4)",
+            "Give one length for all frames, in the tracks' unit.",
+        )
+
 
 class TestSettings:
     @pytest.mark.parametrize(

@@ -127,6 +127,18 @@ def test_the_grid_stencil_needs_a_grid() -> None:
         )  # fmt: skip
 
 
+def test_observations_are_kept_where_all_are_outliers(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, rotations, tracks, _ = scene()
+    points, visible = tracks.points.copy(), np.ones(tracks.visible.shape)
+    visible[:, 1] = np.arange(len(visible)) % 2
+    points[::3, ::4] += 3
+    monkeypatch.setattr("pliant.solver.reconstruction.start.OUTLIER_SHARE", -1.0)
+    monkeypatch.setattr("pliant.solver.reconstruction.start.gross_outliers", lambda *_, **__: visible > 0)
+    found = solve(Tracks.from_arrays(points, visible), cameras=cameras_of(rotations))
+    assert np.isfinite(found.trace.residual).all()
+    assert found.weights.any()
+
+
 def test_equations_that_are_singular_to_rounding_are_an_error_of_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:
     def singular(*_: object, **__: object) -> None:
         raise np.linalg.LinAlgError("not positive definite")
