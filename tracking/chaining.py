@@ -94,8 +94,11 @@ class Chain:
         Positions in the template, and in frames identical to it, are exact: half of their variance or more is `ROUNDING`. If most visible
         positions are exact, as in a film whose object rests for a while, the median excludes them.
         """
-        rows = evenly_spread(len(self.points), JUDGED_FRAMES)
-        found = self.variance[rows][self.visible[rows]]
+        parts = []
+        for t in evenly_spread(len(self.points), JUDGED_FRAMES):
+            parts.append(self.variance[t][self.visible[t]])
+            self.let_go()
+        found = np.concatenate(parts)
         inexact = found[found > 2 * ROUNDING]
         if inexact.size == 0:
             return None
