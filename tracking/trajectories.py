@@ -26,7 +26,8 @@ from pliant.tracking.flow import Bools, Floats
 from pliant.tracking.registration import Registration
 
 WINDOW = 300
-"""Maximum number of frames whose paths are fitted together, besides the template; bounds the memory."""
+"""Maximum number of frames whose paths are fitted together, besides the template; bounds the memory. Not tuned. On a rendered face of 660
+frames, one part and three have median errors of .136 px both, 95th percentiles of .71 and .70 px, and recalls of .973 and .966."""
 
 POINTS_AT_ONCE = 512
 """Points whose paths are computed together; all at once, in double precision, take six times the tracks' memory."""
