@@ -297,8 +297,8 @@ class Options(Chosen):
     template_frame: Annotated[int, Field(ge=0, le=10_000_000)] | None = Field(
         default=None,
         description="For a film: the frame whose points are tracked in both directions, counted in the complete film from 0; null: the "
-        "region's frame if it lies in the middle third of the film or the region is mostly lost there, otherwise the sharpest "
-        "frame of that third.",
+        "region's frame if it lies in the middle third of the film, otherwise the sharpest frame of that third, or a frame on the way "
+        "there if most of the region is lost.",
     )
     grid_step: Annotated[float, Field(ge=1, le=100, allow_inf_nan=False)] | None = Field(
         default=None,

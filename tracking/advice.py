@@ -49,11 +49,11 @@ def warnings_before(
     whole: bool,
     rough: float,
     region_frame: int = 0,
-    lost_in_middle: bool = False,
+    lost_in_middle: int | None = None,
 ) -> list[str]:
     """Return warnings about the film in rows `start` to `stop`: region, shots, length, frame rate, and texture in a share `rough`.
 
-    `lost_in_middle` as in `planning.plan.Plan`.
+    `lost_in_middle` is the template's row if `planning.plan.Plan.lost_in_middle`, else None.
     """
     notes = warnings_unread(whole=whole, region_frame=region_frame)
     if found.cuts:
@@ -72,10 +72,10 @@ def warnings_before(
     steps = np.diff(found.times[start:stop])
     if film.container in ("mp4", "matroska", "avi", "gif") and steps.max() > UNEVEN * np.median(steps):
         notes.append("The time between frames varies; frame_times holds the true times.")
-    if lost_in_middle:
+    if lost_in_middle is not None:
         notes.append(
-            "The region was mostly lost on the way to the middle of the film, so points are followed from the frame in which it was drawn. "
-            "Far from this frame the tracks are less accurate. Draw the region on a frame in the middle."
+            "The region was mostly lost on the way to the middle of the film, so points are followed from frame "
+            f"{found.indices[lost_in_middle]}. Far from this frame the tracks are less accurate. Draw the region on a frame in the middle."
         )
     if rough < 0.5:
         notes.append(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -97,8 +97,8 @@ def transport(
     pool: ThreadPoolExecutor,
     on_step: OnStep,
     should_stop: Callable[[], bool],
-) -> Bools:
-    """Carry a region `(H, W)` from one frame to another and return its mask there.
+) -> Iterator[tuple[int, Bools]]:
+    """Carry a region `(H, W)` from one frame to another; yield frames on the way, at last the other one, and its mask in each.
 
     The grid's points are carried directly from the start and in steps of at most `LONG_STEP` frames. Of two visible results, the one with
     the smaller sum of squared cycle errors is taken; unlike in `chaining`, steps add no variance of their own. Every pixel of the region
@@ -123,7 +123,7 @@ def transport(
         points, seen, variance = best_of(found, sees, sums)
         seen = appearance.agrees(frame, points, seen)
         on_step(TrackingStep("locate", abs(here - start), abs(end - start)))
-    return _cover(region, seeds.points[seen], points[seen], default_step(region), read(end).shape)
+        yield here, _cover(region, seeds.points[seen], points[seen], default_step(region), frame.shape)
 
 
 def _cover(region: Bools, before: Floats, after: Floats, step: float, shape: tuple[int, ...]) -> Bools:

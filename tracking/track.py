@@ -79,8 +79,8 @@ def track_film(
         as well, to follow the region to them.
     template_frame
         Frame whose points are followed to both ends, counted likewise: the selected frame nearest to this number; by default the
-        region's frame if it lies in the middle third of the shot or the region is mostly lost there, otherwise the sharpest frame
-        of that third, to which the region is followed.
+        region's frame if it lies in the middle third of the shot, otherwise the sharpest frame of that third, to which the region is
+        followed, or a frame on the way there if most of the region is lost.
     grid_step
         Distance of neighbouring points in the film's pixels, at least one pixel of the tracker's frames; by default 4 to 8 of these,
         chosen for about 4,000 points in the region.
@@ -134,7 +134,7 @@ def _track(run: Run, found: Survey, plan: Plan, step: float | None, *, whole: bo
     def warnings(rough: float) -> list[str]:
         return warnings_before(
             run.film, found, plan.start, plan.stop, whole=whole, region_frame=region_frame, rough=rough,
-            lost_in_middle=plan.lost_in_middle,
+            lost_in_middle=plan.template if plan.lost_in_middle else None,
         )  # fmt: skip
 
     template = run.store.read(plan.template)
@@ -174,7 +174,7 @@ def _track(run: Run, found: Survey, plan: Plan, step: float | None, *, whole: bo
     if len(kept) < LEAST_POINTS:
         raise FilmError(
             "tracks_lost", field="film",
-            expected=f"at least {LEAST_POINTS} points that stay visible in {LEAST_SEEN:.0%} of the frames, and in two or more",
+            expected=f"at least {LEAST_POINTS} neighbouring points that stay visible in {LEAST_SEEN:.0%} of the frames, and in two or more",
             got=str(len(kept)),
             hint=FILM_SLOWLY,
         )  # fmt: skip

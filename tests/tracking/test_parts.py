@@ -23,6 +23,7 @@ from pliant.tracking.region import read_region
 from pliant.tracking.rendering import Truth, render_film
 from pliant.tracking.seeding import keep, neighbours, place, quads
 from pliant.tracking.survey import find_cuts, sharpest, tracking_scale
+from scipy import ndimage
 
 
 def grey(count: int = 2, step: int = 2) -> list[np.ndarray]:
@@ -303,6 +304,21 @@ def test_grids_lose_points_without_a_face_and_keep_their_order() -> None:
     np.testing.assert_array_equal(np.sort(grid[grid >= 0]), np.arange(len(kept)))
     beside = neighbours(grid, len(kept))
     assert beside[grid[0, 2]].tolist() == [-1, grid[0, 3], -1, grid[1, 2]]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_strips_and_islands_less_than_three_points_wide_are_dropped(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    places = cv2.GaussianBlur(random.normal(size=(20, 30)), (0, 0), 1.0) > -0.3
+    grid = np.full(places.shape, -1, np.int32)
+    grid[places] = np.arange(np.count_nonzero(places))
+    wanted = random.random(np.count_nonzero(places)) > 0.1
+    left = np.zeros(places.shape, bool)
+    left[places] = wanted
+    expected = ndimage.binary_opening(left, np.ones((3, 3)))
+    _, kept = keep(grid, wanted)
+    assert 0 < len(kept) < np.count_nonzero(wanted)
+    np.testing.assert_array_equal(kept, grid[expected])
 
 
 def test_a_step_wider_than_the_picture_places_no_points() -> None:

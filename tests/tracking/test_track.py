@@ -367,12 +367,23 @@ def test_the_template_is_the_region_s_frame_or_one_in_the_middle(tmp_path: Path)
         moved = tracked.template - drawn
         across = tracked.tracks[tracked.template][:, 0]
         assert (across.min(), across.max()) == pytest.approx((10 + moved, 40 + moved), abs=5)
-    for number, picture in enumerate(pictures):
-        picture[max(14, 72 - 15 * number) :] = 120  # a blank panel rises and covers the region
+
+
+@pytest.mark.parametrize(("speed", "template"), [(3, 5), (6, 3), (60, 0)])
+def test_a_region_lost_before_the_middle_is_tracked_from_a_frame_on_the_way(
+    tmp_path: Path, speed: int, template: int
+) -> None:
+    """A blank panel rises and covers two thirds of the region, in the last case at once."""
+    picture = films.textured_pictures(1, (96, 72))[0]
+    pictures = [np.array(picture) for _ in range(24)]
+    for number, shown in enumerate(pictures[1:], start=1):
+        shown[max(32, 58 - speed * number) :] = 120
     path = films.write_film(tmp_path / "film.mkv", pictures)
-    lost = track_film(path, region=region, grid_step=4)
-    assert lost.template == 0, "the region is lost in the middle"
-    assert any(each.startswith("The region was mostly lost on the way to the middle") for each in lost.warnings)
+    lost = track_film(path, region=[(10, 20), (60, 20), (60, 55), (10, 55)], grid_step=4)
+    assert lost.template == pytest.approx(template, abs=2 if template else 0)
+    said = [each for each in lost.warnings if each.startswith("The region was mostly lost on the way to the middle")]
+    assert len(said) == 1
+    assert f"from frame {lost.template}. " in said[0]
 
 
 def test_a_region_lost_before_the_template_is_rejected(tmp_path: Path) -> None:
@@ -407,7 +418,7 @@ def test_a_tiny_region_cannot_be_transferred(turning: tuple[Path, RenderedFilm])
 
 def test_a_frame_skipped_by_the_selection_stands_for_the_nearest_used_one(turning: tuple[Path, RenderedFilm]) -> None:
     path, film = turning
-    tracked = track_film(path, region=film.region(15), region_frame=15, frames="::2", grid_step=3)
+    tracked = track_film(path, region=film.region(15), region_frame=15, template_frame=15, frames="::2", grid_step=3)
     assert tracked.film.frame_indices[tracked.template] == 14
 
 

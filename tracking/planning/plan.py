@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -20,8 +20,7 @@ from pliant.tracking.seeding import default_step, place
 from pliant.tracking.survey import Survey, middle_of, sharpest
 
 LEAST_LEFT, LEAST_LEFT_BY_DEFAULT = 0.1, 0.5
-"""Share of the region's area that must be found in the template: in a given one, and in the middle of the film, which is otherwise not the
-template. Not tuned."""
+"""Share of the region's area that must be found in the template: in a given one, and in one that is chosen. Not tuned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,16 +45,16 @@ class Plan:
     mask: Bools
 
     lost_in_middle: bool = False
-    """Whether the template is the region's frame only because the region is mostly lost in the middle of the shot."""
+    """Whether the template is not in the middle of the shot only because the region is mostly lost there."""
 
 
 def plan_of(run: Run, found: Survey, mask: Bools | None, *, region_frame: int, template_frame: int | None) -> Plan:
     """Choose shot and template, and carry the region, a mask `(H, W)` of the film's size in `region_frame`, to the template.
 
-    By default, the template is the region's frame if that lies in the middle third of the shot or the region is mostly lost there,
-    otherwise the sharpest frame of that third: the farther a frame is from the template, the less its picture resembles it. With the region
-    drawn on the first frame, an opening hand was tracked with a median error of .53 px from that frame and .35 px from the middle, and its
-    shapes had errors of .51 and .08.
+    By default, the template is the region's frame if that lies in the middle third of the shot, otherwise the sharpest frame of that third:
+    the farther a frame is from the template, the less its picture resembles it. With the region drawn on the first frame, an opening hand
+    was tracked with a median error of .53 px from that frame and .35 px from the middle, and its shapes had errors of .51 and .08. If the
+    region is mostly lost on the way, the template is a frame on that way, see `_farthest`.
 
     Raises
     ------
@@ -83,9 +82,10 @@ def plan_of(run: Run, found: Survey, mask: Bools | None, *, region_frame: int, t
     scaled = resized(mask, shape)
     lost = template is None and origin not in middle_of(start, stop)
     if lost:
-        carried = _carried(run, scaled, origin, middle)
-        if carried.sum() >= LEAST_LEFT_BY_DEFAULT * scaled.sum():
-            return Plan(start, stop, middle, carried)
+        found_in = {row: carried for row, carried in _carried(run, scaled, origin, middle) if start <= row < stop}
+        template = _farthest(found_in, scaled, origin, middle)
+        if template is not None:
+            return Plan(start, stop, template, found_in[template], template not in middle_of(start, stop))
     template = min(max(origin, start), stop - 1) if template is None else template
     return Plan(start, stop, template, scaled if template == origin else _carry(run, scaled, origin, template), lost)
 
@@ -114,7 +114,7 @@ def _shot(found: Survey, row: int | None) -> tuple[int, int]:
 
 def _carry(run: Run, mask: Bools, origin: int, template: int) -> Bools:
     """Carry the region to a given template."""
-    carried = _carried(run, mask, origin, template)
+    carried = dict(_carried(run, mask, origin, template)).get(template, np.zeros_like(mask))
     if carried.sum() < LEAST_LEFT * mask.sum():
         raise FilmError(
             "region_lost", field="region", expected="a region that can be followed to the template",
@@ -125,13 +125,28 @@ def _carry(run: Run, mask: Bools, origin: int, template: int) -> Bools:
     return carried
 
 
-def _carried(run: Run, mask: Bools, origin: int, template: int) -> Bools:
-    """Return the part of the region that is found in the template, with points without texture too, because only the outline counts."""
+def _farthest(found_in: dict[int, Bools], mask: Bools, origin: int, middle: int) -> int | None:
+    """Return the row of the template: the middle if at least half of the region is found there, otherwise a row on the way to it.
+
+    A template with the share q of the points, d frames from the drawn one, follows them in these frames and, as an estimate, in as many
+    beyond. Of the rows with at least half of the region, the one with the largest q d is returned; None if there is none.
+    """
+    shares = {row: min(float(carried.sum() / mask.sum()), 1.0) for row, carried in found_in.items()}
+    enough = {row: share for row, share in shares.items() if share >= LEAST_LEFT_BY_DEFAULT}
+    if middle in enough:
+        return middle
+    return max(enough, key=lambda row: enough[row] * abs(row - origin), default=None)
+
+
+def _carried(run: Run, mask: Bools, origin: int, end: int) -> Iterator[tuple[int, Bools]]:
+    """Yield rows on the way to another one and the part of the region that is found there, with points without texture too, because only
+    the outline counts; nothing if no point of the grid lies in the region.
+    """
     seeds, _ = place(run.store.read(origin), mask, step=default_step(mask), everywhere=True)
     if len(seeds.points) == 0:
-        return np.zeros_like(mask)
+        return iter(())
     return transport(
-        run.store.read, mask, seeds, origin, template, pool=run.pool, on_step=run.on_step, should_stop=run.should_stop
+        run.store.read, mask, seeds, origin, end, pool=run.pool, on_step=run.on_step, should_stop=run.should_stop
     )
 
 

@@ -105,7 +105,7 @@ const HELP: Record<string, string> = {
   frames: "Start:stop:step as in Python, for example 10:200:2. If empty: all frames.",
   max_points: "Points are chosen evenly, and the mesh is simplified accordingly. If empty: all points.",
   template_frame:
-    "Frame whose points are tracked in both directions, counted in the complete film from 0. If empty: the frame that the region is drawn on if it lies in the middle third of the film or the region is mostly lost there, otherwise the sharpest frame of that third.",
+    "Frame whose points are tracked in both directions, counted in the complete film from 0. If empty: the frame that the region is drawn on if it lies in the middle third of the film, otherwise the sharpest frame of that third, or a frame on the way there if most of the region is lost.",
   grid_step: "Distance of neighbouring points in the film's pixels. If empty, it is chosen for about 4,000 points.",
   longest_side: "Larger films are scaled down for tracking. Tracks remain in the film's own pixels.",
 };

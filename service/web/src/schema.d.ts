@@ -842,7 +842,7 @@ export interface components {
             min_seen: number;
             /**
              * Template Frame
-             * @description For a film: the frame whose points are tracked in both directions, counted in the complete film from 0; null: the region's frame if it lies in the middle third of the film or the region is mostly lost there, otherwise the sharpest frame of that third.
+             * @description For a film: the frame whose points are tracked in both directions, counted in the complete film from 0; null: the region's frame if it lies in the middle third of the film, otherwise the sharpest frame of that third, or a frame on the way there if most of the region is lost.
              * @default null
              */
             template_frame: number | null;
