@@ -8,6 +8,7 @@ the viewing rays are left out.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -119,7 +120,14 @@ class Tried:
     found: Isometry
 
 
-def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) -> list[Tried]:
+def sweep(
+    search: FocalSearch,
+    focal: float,
+    diagonal: float,
+    *,
+    given: bool,
+    worthwhile: Callable[[Tried], bool] = lambda _: True,
+) -> list[Tried]:
     """Return the isometries tried: downhill from the first focal length by `FOCAL_STEP`, at most one step beyond `FOCAL_RANGE`.
 
     A given focal length is tried first and kept. Others are left out if the surface is stretched there: the search starts with the next
@@ -127,7 +135,7 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
 
     Distances between the ends of edges vary where the surface bends. They make focal lengths that are too long more consistent, since the
     surface bends less there, so lengths along the surface are needed before longer ones are tried. Unless `given`, the bracket of the
-    minimum is then searched, if a minimum there could be accepted.
+    minimum is then searched, if a minimum there could be accepted and the least I is `worthwhile`.
     """
     # A given focal length may be outside the range.
     ends = min(FOCAL_RANGE[0] * diagonal, focal), max(FOCAL_RANGE[1] * diagonal, focal)
@@ -143,7 +151,7 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
         if kept:
             search, tried = along_surface, kept
         tried = _downhill(search, tried, ends)
-    if not given and _may_be_accepted(tried, ends):
+    if not given and _may_be_accepted(tried, ends) and worthwhile(least_of(tried)):
         tried += _golden(search, least_of(tried))
         # The new minimum may lack a neighbour at the distance of a step.
         tried += _beside(search, tried, least_of(tried))

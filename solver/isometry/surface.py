@@ -167,7 +167,11 @@ def isometric_surface(
     search = _search(tracks, centre, first, required, should_stop)
     if isinstance(search, str):
         return IsometricVerdict(search)
-    tried = sweep(search, first, diagonal, given=focal is not None)
+
+    def worthwhile(least: Tried) -> bool:
+        return required or _rigid(search, least) is None
+
+    tried = sweep(search, first, diagonal, given=focal is not None, worthwhile=worthwhile)
     if search.should_stop():
         return IsometricVerdict("Stopped before the test for isometry had finished.", _trace(tried))
     if not tried:
@@ -202,6 +206,8 @@ def _verdict(
     """Return the verdict on the surface at the given focal length, or at the best of those tried."""
     least = least_of(tried)
     judgement, chosen = judged(tried, least), least if focal is None else tried[0]
+    if not required and (rigid := _rigid(search, chosen)) is not None:
+        return IsometricVerdict(rigid, _trace(tried))
     supported, why = _confirmed(search, chosen, judgement) if judgement.ratio > 0 else (False, judgement.words)
     if not supported and not required:
         advice = "If it is one that keeps its lengths, such as paper or cloth seen from nearby, try surface=isometric and compare."
@@ -215,8 +221,6 @@ def _verdict(
     surface = _everywhere(search, tracks, chosen, seed)
     if surface is None:
         return IsometricVerdict("No isometric surface was found: its points are not connected.", _trace(tried))
-    if not required and (rigid := _rigid(search, surface)) is not None:
-        return IsometricVerdict(rigid, _trace(tried))
     return IsometricVerdict(why, _trace(tried), surface, warnings, weak=not (judgement.clear or required))
 
 
@@ -263,14 +267,20 @@ def _confirmed(search: FocalSearch, chosen: Tried, judgement: Judgement) -> tupl
     return False, f"its edge lengths differ {change} between halves of the frames"
 
 
-def _rigid(search: FocalSearch, surface: IsometricSurface) -> str | None:
-    """Return the reason why the surface is a rigid solid; None if it bends.
+def _rigid(search: FocalSearch, tried: Tried) -> str | None:
+    """Return the reason why the anchors are those of a rigid solid; None if they deform, or too few frames show enough of them.
 
     Images of a sheet differ from images of a plane because the sheet bends; images of a solid differ because of its constant depth. A rigid
     solid also keeps all lengths, but it is better solved as a free surface: the error of a rigid face is .0002, and .05 as a sheet.
     """
-    off = off_homography(search.anchors.points[search.frames], search.seen[search.frames])
-    bends = deformation(surface.points[:, :: max(1, surface.points.shape[1] // FIRST_LOOK)])
+    seen = tried.graph.seen
+    template = flatten(search.edges, tried.found.lengths, seen.shape[1])
+    if template is None:
+        return None
+    points, enough = complete_anchors(tried.found.depths[..., None] * tried.graph.rays, seen, template)
+    if enough.sum() < 2:
+        return None
+    off, bends = off_homography(search.anchors.points[search.frames], seen), deformation(points[enough])
     if bends >= off:
         return None
     return (

@@ -139,8 +139,9 @@ def _farthest(found_in: dict[int, Bools], mask: Bools, origin: int, middle: int)
 
 
 def _carried(run: Run, mask: Bools, origin: int, end: int) -> Iterator[tuple[int, Bools]]:
-    """Yield rows on the way to another one and the part of the region that is found there, with points without texture too, because only
-    the outline counts; nothing if no point of the grid lies in the region.
+    """Yield rows on the way to another one, each with the part of the region that is found there.
+
+    Points without texture are used, too, because only the outline counts. Nothing is found if no point of the grid lies in the region.
     """
     seeds, _ = place(run.store.read(origin), mask, step=default_step(mask), everywhere=True)
     if len(seeds.points) == 0:

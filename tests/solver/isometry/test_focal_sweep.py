@@ -45,6 +45,19 @@ def test_the_focal_sweep_finds_a_minimum_and_tries_its_neighbours(monkeypatch: p
     assert focal_sweep.judged(tried, least).clear
 
 
+def test_a_minimum_that_is_not_worthwhile_is_not_narrowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_inconsistencies(monkeypatch, lambda focal: 0.002 + 0.02 * float(np.log(focal / 700)) ** 2)
+    asked: list[focal_sweep.Tried] = []
+    coarse = focal_sweep.sweep(
+        SEARCH, 0.8 * DIAGONAL, DIAGONAL, given=False, worthwhile=lambda least: asked.append(least) is not None
+    )
+    assert asked == [focal_sweep.least_of(coarse)]
+    steps = np.log([each.focal / (0.8 * DIAGONAL) for each in coarse]) / np.log(focal_sweep.FOCAL_STEP)
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
+    fine = focal_sweep.sweep(SEARCH, 0.8 * DIAGONAL, DIAGONAL, given=False, worthwhile=lambda _: True)
+    assert len(fine) > len(coarse)
+
+
 def test_the_focal_sweep_starts_where_the_surface_is_not_stretched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stretched surfaces have a small I at focal lengths that are far too long."""
 
