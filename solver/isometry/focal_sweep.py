@@ -135,7 +135,8 @@ def sweep(
 
     Distances between the ends of edges vary where the surface bends. They make focal lengths that are too long more consistent, since the
     surface bends less there, so lengths along the surface are needed before longer ones are tried. Unless `given`, the bracket of the
-    minimum is then searched, if a minimum there could be accepted and the least I is `worthwhile`.
+    minimum is then searched, if a minimum there could be accepted. An isometry that is not `worthwhile`, the first or that with the least I
+    before the bracket is searched, ends the sweep.
     """
     # A given focal length may be outside the range.
     ends = min(FOCAL_RANGE[0] * diagonal, focal), max(FOCAL_RANGE[1] * diagonal, focal)
@@ -143,6 +144,8 @@ def sweep(
     first = None if begun is None else _first(begun, focal, shortest=focal if given else ends[0])
     if begun is None or first is None:
         return []
+    if not worthwhile(first):
+        return [first]
     search = begun
     tried = _downhill(search, [first], ends, sides=(-1,))
     for _ in range(ROUNDS):
