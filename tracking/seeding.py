@@ -77,11 +77,7 @@ def textured(image: Grey) -> Bools:
 
 def number(plane: Floats, wanted: Bools) -> Seeds:
     """Assign numbers to the wanted cells that belong to a face, row by row; drop empty rows and columns."""
-    square = wanted[:-1, :-1] & wanted[1:, :-1] & wanted[:-1, 1:] & wanted[1:, 1:]
-    kept = np.zeros_like(wanted)
-    for down in (0, 1):
-        for right in (0, 1):
-            kept[down : down + len(square), right : right + square.shape[1]] |= square
+    kept = _in_faces(wanted)
     grid = np.full(wanted.shape, -1, dtype=np.int32)
     grid[kept] = np.arange(int(kept.sum()))
     used = np.ix_(kept.any(axis=1), kept.any(axis=0))
@@ -103,25 +99,29 @@ def neighbours(grid: Ints, num_points: int) -> NDArray[np.int64]:
     return found
 
 
-def keep(grid: Ints, wanted: Bools) -> tuple[Ints, NDArray[np.int64]]:
+def keep(grid: Ints, wanted: Bools, *, least: int = 1) -> tuple[Ints, NDArray[np.int64]]:
     """Drop points from a grid; return the renumbered grid and the old indices of the points that stay.
 
-    Strips and islands less than three points wide are dropped as well. Without neighbours on all sides, nothing holds their points in
-    place: on a film of a soft toy, they ended several times its size away from it.
+    Pieces of fewer than `least` points are dropped as well. Nothing holds them in place: on a film of a soft toy, some ended several
+    times its size away from it.
     """
-    old = grid[grid >= 0]
+    places = grid >= 0
     cells = np.zeros(grid.shape, dtype=bool)
-    cells[grid >= 0] = _without_strips(wanted[old], grid >= 0)
+    cells[places] = wanted[grid[places]]
+    cells = _in_faces(cells)
+    _, piece, statistics, _ = cv2.connectedComponentsWithStats(cells.astype(np.uint8), connectivity=4)
+    cells &= statistics[piece, cv2.CC_STAT_AREA] >= least
     plane = np.zeros((*grid.shape, 2), dtype=np.float32)
-    plane[grid >= 0, 0] = old
+    plane[places, 0] = grid[places]
     seeds = number(plane, cells)
     return seeds.grid, seeds.points[:, 0].astype(np.int64)
 
 
-def _without_strips(wanted: Bools, places: Bools) -> Bools:
-    """Return which wanted points of a grid, whose `places` are a mask `(rows, columns)`, lie in a block of 3 × 3 wanted ones."""
-    plane = np.zeros(places.shape, dtype=np.uint8)
-    plane[places] = wanted
-    block = np.ones((3, 3), np.uint8)
-    centres = cv2.erode(plane, block, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    return np.asarray(cv2.dilate(centres, block, borderType=cv2.BORDER_CONSTANT, borderValue=0)[places] > 0)
+def _in_faces(wanted: Bools) -> Bools:
+    """Return the wanted cells that are a corner of a square of four."""
+    square = wanted[:-1, :-1] & wanted[1:, :-1] & wanted[:-1, 1:] & wanted[1:, 1:]
+    kept = np.zeros_like(wanted)
+    for down in (0, 1):
+        for right in (0, 1):
+            kept[down : down + len(square), right : right + square.shape[1]] |= square
+    return kept

@@ -36,7 +36,7 @@ LEAST_SEEN = 0.2
 """Share of the frames in which a point must be visible to be kept."""
 
 LEAST_POINTS = 16
-"""Minimum number of points for a surface: a 4 × 4 grid."""
+"""Minimum number of points for a surface, and for each of its pieces: a 4 × 4 grid."""
 
 THUMBNAILS = 6
 THUMBNAIL_WIDTH = 320
@@ -170,7 +170,7 @@ def _track(run: Run, found: Survey, plan: Plan, step: float | None, *, whole: bo
         on_part=lambda done, total: run.on_step(TrackingStep("fit", done, total)),
     )  # fmt: skip
     seen = chained.times_seen()  # once is in the template alone, where no point moves
-    kept_grid, kept = keep(seeds.grid, (seen / length >= LEAST_SEEN) & (seen >= 2))
+    kept_grid, kept = keep(seeds.grid, (seen / length >= LEAST_SEEN) & (seen >= 2), least=LEAST_POINTS)
     if len(kept) < LEAST_POINTS:
         raise FilmError(
             "tracks_lost", field="film",

@@ -307,18 +307,20 @@ def test_grids_lose_points_without_a_face_and_keep_their_order() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_strips_and_islands_less_than_three_points_wide_are_dropped(seed: int) -> None:
+def test_small_pieces_of_a_grid_are_dropped(seed: int) -> None:
     random = np.random.default_rng(seed)
-    places = cv2.GaussianBlur(random.normal(size=(20, 30)), (0, 0), 1.0) > -0.3
+    places = cv2.GaussianBlur(random.normal(size=(40, 60)), (0, 0), 1.5) > -0.02
     grid = np.full(places.shape, -1, np.int32)
     grid[places] = np.arange(np.count_nonzero(places))
-    wanted = random.random(np.count_nonzero(places)) > 0.1
-    left = np.zeros(places.shape, bool)
-    left[places] = wanted
-    expected = ndimage.binary_opening(left, np.ones((3, 3)))
-    _, kept = keep(grid, wanted)
-    assert 0 < len(kept) < np.count_nonzero(wanted)
-    np.testing.assert_array_equal(kept, grid[expected])
+    wanted = random.random(np.count_nonzero(places)) > 0.02
+    every, kept = keep(grid, wanted)
+    pieces, count = ndimage.label(every >= 0)
+    sizes = np.bincount(pieces.ravel())[1:]
+    assert count > 1
+    assert min(sizes) < 16 <= max(sizes)
+    expected = np.sort(every[(every >= 0) & np.isin(pieces, 1 + np.flatnonzero(sizes >= 16))])
+    _, large = keep(grid, wanted, least=16)
+    np.testing.assert_array_equal(large, kept[expected])
 
 
 def test_a_step_wider_than_the_picture_places_no_points() -> None:
