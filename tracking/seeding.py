@@ -77,7 +77,11 @@ def textured(image: Grey) -> Bools:
 
 def number(plane: Floats, wanted: Bools) -> Seeds:
     """Assign numbers to the wanted cells that belong to a face, row by row; drop empty rows and columns."""
-    kept = _in_faces(wanted)
+    square = wanted[:-1, :-1] & wanted[1:, :-1] & wanted[:-1, 1:] & wanted[1:, 1:]
+    kept = np.zeros_like(wanted)
+    for down in (0, 1):
+        for right in (0, 1):
+            kept[down : down + len(square), right : right + square.shape[1]] |= square
     grid = np.full(wanted.shape, -1, dtype=np.int32)
     grid[kept] = np.arange(int(kept.sum()))
     used = np.ix_(kept.any(axis=1), kept.any(axis=0))
@@ -99,29 +103,12 @@ def neighbours(grid: Ints, num_points: int) -> NDArray[np.int64]:
     return found
 
 
-def keep(grid: Ints, wanted: Bools, *, least: int = 1) -> tuple[Ints, NDArray[np.int64]]:
-    """Drop points from a grid; return the renumbered grid and the old indices of the points that stay.
-
-    Pieces of fewer than `least` points are dropped as well. Nothing holds them in place: on a film of a soft toy, some ended several
-    times its size away from it.
-    """
-    places = grid >= 0
+def keep(grid: Ints, wanted: Bools) -> tuple[Ints, NDArray[np.int64]]:
+    """Drop points from a grid; return the renumbered grid and the old indices of the points that stay."""
+    old = grid[grid >= 0]
     cells = np.zeros(grid.shape, dtype=bool)
-    cells[places] = wanted[grid[places]]
-    cells = _in_faces(cells)
-    _, piece, statistics, _ = cv2.connectedComponentsWithStats(cells.astype(np.uint8), connectivity=4)
-    cells &= statistics[piece, cv2.CC_STAT_AREA] >= least
+    cells[grid >= 0] = wanted[old]
     plane = np.zeros((*grid.shape, 2), dtype=np.float32)
-    plane[places, 0] = grid[places]
+    plane[grid >= 0, 0] = old
     seeds = number(plane, cells)
     return seeds.grid, seeds.points[:, 0].astype(np.int64)
-
-
-def _in_faces(wanted: Bools) -> Bools:
-    """Return the wanted cells that are a corner of a square of four."""
-    square = wanted[:-1, :-1] & wanted[1:, :-1] & wanted[:-1, 1:] & wanted[1:, 1:]
-    kept = np.zeros_like(wanted)
-    for down in (0, 1):
-        for right in (0, 1):
-            kept[down : down + len(square), right : right + square.shape[1]] |= square
-    return kept

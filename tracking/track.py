@@ -36,7 +36,7 @@ LEAST_SEEN = 0.2
 """Share of the frames in which a point must be visible to be kept."""
 
 LEAST_POINTS = 16
-"""Minimum number of points for a surface, and for each of its pieces: a 4 × 4 grid."""
+"""Minimum number of points for a surface: a 4 × 4 grid."""
 
 THUMBNAILS = 6
 THUMBNAIL_WIDTH = 320
@@ -170,11 +170,11 @@ def _track(run: Run, found: Survey, plan: Plan, step: float | None, *, whole: bo
         on_part=lambda done, total: run.on_step(TrackingStep("fit", done, total)),
     )  # fmt: skip
     seen = chained.times_seen()  # once is in the template alone, where no point moves
-    kept_grid, kept = keep(seeds.grid, (seen / length >= LEAST_SEEN) & (seen >= 2), least=LEAST_POINTS)
+    kept_grid, kept = keep(seeds.grid, (seen / length >= LEAST_SEEN) & (seen >= 2))
     if len(kept) < LEAST_POINTS:
         raise FilmError(
             "tracks_lost", field="film",
-            expected=f"at least {LEAST_POINTS} neighbouring points that stay visible in {LEAST_SEEN:.0%} of the frames, and in two or more",
+            expected=f"at least {LEAST_POINTS} points that stay visible in {LEAST_SEEN:.0%} of the frames, and in two or more",
             got=str(len(kept)),
             hint=FILM_SLOWLY,
         )  # fmt: skip

@@ -23,7 +23,6 @@ from pliant.tracking.region import read_region
 from pliant.tracking.rendering import Truth, render_film
 from pliant.tracking.seeding import keep, neighbours, place, quads
 from pliant.tracking.survey import find_cuts, sharpest, tracking_scale
-from scipy import ndimage
 
 
 def grey(count: int = 2, step: int = 2) -> list[np.ndarray]:
@@ -304,23 +303,6 @@ def test_grids_lose_points_without_a_face_and_keep_their_order() -> None:
     np.testing.assert_array_equal(np.sort(grid[grid >= 0]), np.arange(len(kept)))
     beside = neighbours(grid, len(kept))
     assert beside[grid[0, 2]].tolist() == [-1, grid[0, 3], -1, grid[1, 2]]
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_small_pieces_of_a_grid_are_dropped(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    places = cv2.GaussianBlur(random.normal(size=(40, 60)), (0, 0), 1.5) > -0.02
-    grid = np.full(places.shape, -1, np.int32)
-    grid[places] = np.arange(np.count_nonzero(places))
-    wanted = random.random(np.count_nonzero(places)) > 0.02
-    every, kept = keep(grid, wanted)
-    pieces, count = ndimage.label(every >= 0)
-    sizes = np.bincount(pieces.ravel())[1:]
-    assert count > 1
-    assert min(sizes) < 16 <= max(sizes)
-    expected = np.sort(every[(every >= 0) & np.isin(pieces, 1 + np.flatnonzero(sizes >= 16))])
-    _, large = keep(grid, wanted, least=16)
-    np.testing.assert_array_equal(large, kept[expected])
 
 
 def test_a_step_wider_than_the_picture_places_no_points() -> None:
