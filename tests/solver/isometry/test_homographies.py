@@ -104,7 +104,7 @@ def test_a_long_film_is_compared_at_a_fixed_number_of_frames(monkeypatch: pytest
     monkeypatch.setattr(surface, "off_homography", off)
     verdict = isometric_surface(rolled_sheet(40, bend=(0.2, 0.8)).tracks, image_size=SIZE)
     assert verdict.surface is not None
-    assert compared == [surface.SOLVED_FRAMES, surface.SOLVED_FRAMES]
+    assert set(compared) == {surface.SOLVED_FRAMES}
 
 
 def test_deformation_is_the_distance_from_one_rigid_shape() -> None:
