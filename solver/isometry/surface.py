@@ -272,7 +272,7 @@ def _rigid(search: FocalSearch, tried: Tried) -> str | None:
 
     Images of a sheet differ from images of a plane because the sheet bends; images of a solid differ because of its constant depth. A rigid
     solid also keeps all lengths, but it is better solved as a free surface: the error of a rigid face is .0002, and .05 as a sheet. A wrong
-    focal length hardly matters: 28 made-up sheets, which bend .2 to 1 times as much as those of `benchmarks.accuracy.kinds`, with focal
+    focal length hardly matters: 26 made-up sheets, which bend .2 to 1 times as much as those of `benchmarks.accuracy.kinds`, with focal
     lengths .26 to 2.6 times the true one, deform by 1.5 to 10 times as much as their pictures differ from those of a plane.
     """
     seen = tried.graph.seen
