@@ -135,8 +135,7 @@ def sweep(
 
     Distances between the ends of edges vary where the surface bends. They make focal lengths that are too long more consistent, since the
     surface bends less there, so lengths along the surface are needed before longer ones are tried. Unless `given`, the bracket of the
-    minimum is then searched, if a minimum there could be accepted. An isometry that is not `worthwhile`, the first or that with the least I
-    before the bracket is searched, ends the sweep.
+    minimum is then searched, if a minimum there could be accepted. If the first isometry is not `worthwhile`, no other is tried.
     """
     # A given focal length may be outside the range.
     ends = min(FOCAL_RANGE[0] * diagonal, focal), max(FOCAL_RANGE[1] * diagonal, focal)
@@ -154,7 +153,7 @@ def sweep(
         if kept:
             search, tried = along_surface, kept
         tried = _downhill(search, tried, ends)
-    if not given and _may_be_accepted(tried, ends) and worthwhile(least_of(tried)):
+    if not given and _may_be_accepted(tried, ends):
         tried += _golden(search, least_of(tried))
         # The new minimum may lack a neighbour at the distance of a step.
         tried += _beside(search, tried, least_of(tried))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pliant.solver.evaluation.trust import size_of
 from pliant.solver.isometry.anchors import choose_anchors, connected, nearest_neighbours, unlike_frames
 from pliant.solver.isometry.arc_lengths import refine_along_surface
-from pliant.solver.isometry.confirmation import DECISIVE, DISAGREEMENT, deformation, disagreement
+from pliant.solver.isometry.confirmation import DECISIVE, DISAGREEMENT, bending_of, disagreement
 from pliant.solver.isometry.deviations import deviations_at, standard_deviations
 from pliant.solver.isometry.extension import MIN_ANCHORS, Extended, complete_anchors, extend, flatten
 from pliant.solver.isometry.focal_sweep import (
@@ -70,7 +70,7 @@ DIAGONAL_MARGIN = 1.3
 """Ratio of the image diagonal to the diagonal of the tracks' bounding box, assumed if the image size is not given."""
 
 FIRST_LOOK = 200
-"""Approximate number of points used to choose dissimilar frames and to measure deformation."""
+"""Approximate number of points used to choose dissimilar frames."""
 
 TOO_LITTLE = "Too few points are visible in the same frames for an isometric surface."
 
@@ -168,8 +168,9 @@ def isometric_surface(
     if isinstance(search, str):
         return IsometricVerdict(search)
 
-    def worthwhile(least: Tried) -> bool:
-        return required or _rigid(search, least) is None
+    def worthwhile(first: Tried) -> bool:
+        bending = bending_of(search, first)
+        return required or bending is None or not bending.rigid
 
     tried = sweep(search, first, diagonal, given=focal is not None, worthwhile=worthwhile)
     if search.should_stop():
@@ -206,13 +207,16 @@ def _verdict(
     """Return the verdict on the surface at the given focal length, or at the best of those tried."""
     least = least_of(tried)
     judgement, chosen = judged(tried, least), least if focal is None else tried[0]
-    if not required and (rigid := _rigid(search, chosen)) is not None:
-        return IsometricVerdict(rigid, _trace(tried))
+    bending = bending_of(search, chosen)
+    if not required and bending is not None and bending.rigid:
+        return IsometricVerdict(bending.words, _trace(tried))
     supported, why = _confirmed(search, chosen, judgement) if judgement.ratio > 0 else (False, judgement.words)
     if not supported and not required:
         advice = "If it is one that keeps its lengths, such as paper or cloth seen from nearby, try surface=isometric and compare."
         reason = f"Rejected as an isometric sheet: {why}. {advice}"
         return IsometricVerdict(reason, _trace(tried), warnings=(_unrecognised_warning(),))
+    if bending is None and not required:
+        return IsometricVerdict(TOO_LITTLE, _trace(tried))
     warnings = _warnings(None if supported else why, focal, least, chosen)
     if not supported:
         why = f"Solved as an isometric sheet, as set, although {why}."
@@ -265,30 +269,6 @@ def _confirmed(search: FocalSearch, chosen: Tried, judgement: Judgement) -> tupl
         return False, "its edge lengths hardly single out a focal length"
     change = "by more than their length" if share > 1 else f"by {share:.0%}"
     return False, f"its edge lengths differ {change} between halves of the frames"
-
-
-def _rigid(search: FocalSearch, tried: Tried) -> str | None:
-    """Return the reason why the anchors are those of a rigid solid; None if they deform, or too few frames show enough of them.
-
-    Images of a sheet differ from images of a plane because the sheet bends; images of a solid differ because of its constant depth. A rigid
-    solid also keeps all lengths, but it is better solved as a free surface: the error of a rigid face is .0002, and .05 as a sheet. A wrong
-    focal length hardly matters: 26 made-up sheets, which bend .2 to 1 times as much as those of `benchmarks.accuracy.kinds`, with focal
-    lengths .26 to 2.6 times the true one, deform by 1.5 to 10 times as much as their pictures differ from those of a plane.
-    """
-    seen = tried.graph.seen
-    template = flatten(search.edges, tried.found.lengths, seen.shape[1])
-    if template is None:
-        return None
-    points, enough = complete_anchors(tried.found.depths[..., None] * tried.graph.rays, seen, template)
-    if enough.sum() < 2:
-        return None
-    off, bends = off_homography(search.anchors.points[search.frames], seen), deformation(points[enough])
-    if bends >= off:
-        return None
-    return (
-        f"Rejected as an isometric sheet: it deforms by {bends:.1%} of its size, while the pictures differ from those of a plane "
-        f"by {off:.1%}, as those of a rigid solid do."
-    )
 
 
 def _some_frames(points: Floats, seen: NDArray[np.bool_]) -> NDArray[np.intp]:

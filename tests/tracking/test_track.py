@@ -13,6 +13,7 @@ from pliant.solver.gallery import face, flag, sphere
 from pliant.tracking import FilmError, TrackedFilm, TrackingStep, TrackingStopped, track_film
 from pliant.tracking.advice import warnings_of
 from pliant.tracking.contact_sheet import view_of
+from pliant.tracking.planning.plan import _farthest
 from pliant.tracking.rendering import RenderedFilm
 from pliant.tracking.survey import middle_of
 
@@ -384,6 +385,32 @@ def test_a_region_lost_before_the_middle_is_tracked_from_a_frame_on_the_way(
     said = [each for each in lost.warnings if each.startswith("The region was mostly lost on the way to the middle")]
     assert len(said) == 1
     assert f"from frame {lost.template}. " in said[0]
+
+
+@pytest.mark.parametrize(
+    ("shares", "row"),
+    [
+        ((1.0, 0.9, 0.6), 20),  # the middle, although 10 has more
+        ((1.0, 0.9, 0.4), 10),
+        ((1.0, 0.5, 0.4), 10),  # .5 · 10 > 1 · 4
+        ((1.0, 0.4, 0.4), 4),
+        ((0.4, 0.4, 0.4), None),
+        ((0.4, 2.0, 0.4), 10),  # enlarged
+    ],
+)
+def test_the_template_on_the_way_shows_most_of_the_region_for_longest(
+    shares: tuple[float, ...], row: int | None
+) -> None:
+    region = np.zeros((20, 20), bool)
+    region.ravel()[:100] = True
+    parts = [
+        (place, np.arange(400).reshape(20, 20) < 100 * share) for place, share in zip((4, 10, 20), shares, strict=True)
+    ]
+    found = _farthest(iter(parts), region, 0, 20)
+    assert (found is None) == (row is None)
+    if found is not None:
+        assert found[0] == row
+        np.testing.assert_array_equal(found[1], dict(parts)[row])
 
 
 def test_a_region_lost_before_the_template_is_rejected(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -82,10 +82,10 @@ def plan_of(run: Run, found: Survey, mask: Bools | None, *, region_frame: int, t
     scaled = resized(mask, shape)
     lost = template is None and origin not in middle_of(start, stop)
     if lost:
-        found_in = {row: carried for row, carried in _carried(run, scaled, origin, middle) if start <= row < stop}
-        template = _farthest(found_in, scaled, origin, middle)
-        if template is not None:
-            return Plan(start, stop, template, found_in[template], template not in middle_of(start, stop))
+        on_the_way = ((row, part) for row, part in _carried(run, scaled, origin, middle) if start <= row < stop)
+        chosen = _farthest(on_the_way, scaled, origin, middle)
+        if chosen is not None:
+            return Plan(start, stop, *chosen, chosen[0] not in middle_of(start, stop))
     template = min(max(origin, start), stop - 1) if template is None else template
     return Plan(start, stop, template, scaled if template == origin else _carry(run, scaled, origin, template), lost)
 
@@ -114,7 +114,9 @@ def _shot(found: Survey, row: int | None) -> tuple[int, int]:
 
 def _carry(run: Run, mask: Bools, origin: int, template: int) -> Bools:
     """Carry the region to a given template."""
-    carried = dict(_carried(run, mask, origin, template)).get(template, np.zeros_like(mask))
+    carried = np.zeros_like(mask)
+    for _, part in _carried(run, mask, origin, template):
+        carried = part  # at last that in the template
     if carried.sum() < LEAST_LEFT * mask.sum():
         raise FilmError(
             "region_lost", field="region", expected="a region that can be followed to the template",
@@ -125,17 +127,23 @@ def _carry(run: Run, mask: Bools, origin: int, template: int) -> Bools:
     return carried
 
 
-def _farthest(found_in: dict[int, Bools], mask: Bools, origin: int, middle: int) -> int | None:
-    """Return the row of the template: the middle if at least half of the region is found there, otherwise a row on the way to it.
+def _farthest(parts: Iterable[tuple[int, Bools]], mask: Bools, origin: int, middle: int) -> tuple[int, Bools] | None:
+    """Return a row and the part of the region found there: the middle if this is half of it or more, otherwise a row on the way.
 
-    A template with the share q of the points, d frames from the drawn one, follows them in these frames and, as an estimate, in as many
-    beyond. Of the rows with at least half of the region, the one with the largest q d is returned; None if there is none.
+    A template with the share q of the region, d rows from the drawn one, follows it in these rows and, as an estimate, in as many beyond.
+    Of the rows with at least half of the region, the one with the largest q d is returned; None if there is none. One part at a time is in
+    memory besides the best, so that the way may be long.
     """
-    shares = {row: min(float(carried.sum() / mask.sum()), 1.0) for row, carried in found_in.items()}
-    enough = {row: share for row, share in shares.items() if share >= LEAST_LEFT_BY_DEFAULT}
-    if middle in enough:
-        return middle
-    return max(enough, key=lambda row: enough[row] * abs(row - origin), default=None)
+    best, most = None, 0.0
+    for row, part in parts:
+        share = min(float(part.sum() / mask.sum()), 1.0)
+        if share < LEAST_LEFT_BY_DEFAULT:
+            continue
+        if row == middle:
+            return row, part
+        if share * abs(row - origin) > most:
+            best, most = (row, part), share * abs(row - origin)
+    return best
 
 
 def _carried(run: Run, mask: Bools, origin: int, end: int) -> Iterator[tuple[int, Bools]]:
