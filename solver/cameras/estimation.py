@@ -12,6 +12,7 @@ from pliant.solver.cameras.multistart import (
     MULTISTART_FRAMES,
     Candidate,
     carried,
+    continued,
     depth,
     run_multistart,
     with_fixed_rotations,
@@ -151,17 +152,21 @@ def estimate_cameras(
     if settings.refine_rotations:
         best, ran = run_multistart(part, entries, ordered=ordered, should_stop=should_stop)
     own = {each.basis_size: each.rotations for each in factorized}
-    rotations, refined = _everywhere(own[best.basis_size], best, used, settings)
+    rotations, refined = _everywhere(gram, own[best.basis_size], best, used, settings, should_stop)
+    compared = ran if settings.refine_rotations else []
     alternative = None
-    if planar := settings.refine_rotations and is_planar(gram):
-        rotations, alternative, sides = resolve_pose_signs(gram, rotations, ordered=ordered, should_stop=should_stop)
+    if settings.refine_rotations and is_planar(gram):
+        turned, alternative, sides = resolve_pose_signs(gram, rotations, ordered=ordered, should_stop=should_stop)
         refined = f"{refined} {sides}"
-    compared = ran if settings.refine_rotations and not planar else []
+        if alternative is not None or turned is not rotations:
+            rotations, compared = turned, []
     hypotheses = _hypotheses(factorized, compared, part, used)
     if alternative is not None:
         hypotheses = (OtherCameras(best.basis_size, alternative, "reversed poses of some frames"),)
     candidates = tuple(
-        _from_factorization(each.basis_size, _everywhere(own[each.basis_size], each, used, settings)[0])
+        _from_factorization(
+            each.basis_size, _everywhere(gram, own[each.basis_size], each, used, settings, should_stop)[0]
+        )
         for each in compared
     )
     read_only(rotations)
@@ -232,11 +237,22 @@ def _hypotheses(
     )
 
 
-def _everywhere(before: Floats, best: Candidate, used: NDArray[np.intp], settings: Settings) -> tuple[Floats, str]:
+def _everywhere(
+    gram: Floats,
+    before: Floats,
+    best: Candidate,
+    used: NDArray[np.intp],
+    settings: Settings,
+    should_stop: ShouldStop,
+) -> tuple[Floats, str]:
     """Return the rotations of all frames, carried over from the frames of the multistart, and a sentence."""
     if not settings.refine_rotations:
         return before, "Rotations are those of the factorization."
-    after = carried(before, best.cameras[0], used)
+    found = best.cameras[0]
+    if best.smooth_start:
+        after = continued(gram, before, found, used, should_stop=should_stop)
+    else:
+        after = carried(before, found, used)
     if not np.isfinite(after).all():
         return before, "The refinement was rejected: it led to values that are not finite."
     after = start_at_identity(after)

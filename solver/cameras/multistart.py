@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, Motion, Scene, cameras_of, fit, start
+from pliant.solver.model.resection import rotations_between
 from pliant.solver.model.so3 import exponential, logarithm, nearest
 from pliant.solver.pulse import ShouldStop, never
 from pliant.solver.records import Floats
@@ -126,6 +127,10 @@ def run_multistart(
     return running[0], first
 
 
+def _fixed_energy(gram: Floats, rotations: Floats, should_stop: ShouldStop) -> float:
+    return with_fixed_rotations(gram, rotations, 0, smooth_start=True, ordered=True, should_stop=should_stop).energy
+
+
 def refined(candidate: Candidate, iterations: int, *, should_stop: ShouldStop = never) -> Candidate:
     """Return the candidate after `iterations` L-BFGS iterations with free rotations."""
     motion, energy = fit(
@@ -176,6 +181,30 @@ def carried(rotations: Floats, best: Floats, used: NDArray[np.intp]) -> Floats:
     corrections = logarithm(turns @ common.T)
     blended = between(used, corrections, len(rotations))
     return np.asarray(rotations @ exponential(blended) @ common)
+
+
+def continued(
+    gram: Floats, rotations: Floats, best: Floats, used: NDArray[np.intp], *, should_stop: ShouldStop = never
+) -> Floats:
+    """Return rotations of all frames of a film: `carried`, or interpolated between the frames used, whichever is more probable.
+
+    Once the cameras have left those they began from, the corrections are large, and frames in between inherit the jitter or
+    the wrong pose signs of the beginning. Interpolation loses fast motion instead. With every frame used, both are `best`.
+
+    Parameters
+    ----------
+    gram : shape (2F, 2F)
+        W Wᵀ / P of the completed tracks.
+    rotations, best, used
+        As for `carried`.
+    should_stop : callable, optional
+        Called after each iteration; once it returns True, the cameras so far are compared.
+    """
+    by_corrections = carried(rotations, best, used)
+    if len(used) == len(rotations) or not np.isfinite(by_corrections).all():
+        return by_corrections
+    both = by_corrections, rotations_between(used, best, len(rotations))
+    return min(both, key=lambda each: _fixed_energy(gram, each, should_stop))
 
 
 def scaled_prior_weight(gram: Floats) -> float:

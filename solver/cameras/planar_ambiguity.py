@@ -20,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.factorization import leading_eigenpairs, leading_factor
-from pliant.solver.cameras.multistart import carried
+from pliant.solver.cameras.multistart import carried, continued
 from pliant.solver.cameras.scale import rigid_scales
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, fit, start
 from pliant.solver.model.so3 import MIRROR, angles_between, from_rows, start_at_identity
@@ -142,7 +142,11 @@ def resolve_pose_signs(
     begun, _ = starts[fits.index(best)]
     pose_signs = _of_all_frames(found.pose_signs, used, len(planes))
     before = reversed_at(begun, _plane(found.motion)[0], pose_signs)
-    after = start_at_identity(carried(before, found.rotations, used))
+    if ordered:
+        after = continued(gram, before, found.rotations, used, should_stop=should_stop)
+    else:
+        after = carried(before, found.rotations, used)
+    after = start_at_identity(after)
     if best is fits[0]:
         return rotations, after, f"{as_before} Cameras with some poses reversed are an additional start."
     turn = float(np.degrees(angles_between(after, rotations).mean()))
