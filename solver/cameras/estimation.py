@@ -245,7 +245,10 @@ def _everywhere(
     settings: Settings,
     should_stop: ShouldStop,
 ) -> tuple[Floats, str]:
-    """Return the rotations of all frames, carried over from the frames of the multistart, and a sentence."""
+    """Return the rotations of all frames, from those at the frames of the multistart, and a sentence.
+
+    Refinement hardly leaves a factorization, so its corrections are carried over. A smooth start does leave it.
+    """
     if not settings.refine_rotations:
         return before, "Rotations are those of the factorization."
     found = best.cameras[0]

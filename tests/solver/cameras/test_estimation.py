@@ -11,7 +11,7 @@ from pliant.solver import KnownCamera, Settings, Tracks, gallery
 from pliant.solver.cameras import estimation, multistart
 from pliant.solver.cameras.estimation import estimate_cameras, given_cameras
 from pliant.solver.cameras.factorization import upgrade, upgrades
-from pliant.solver.cameras.multistart import carried
+from pliant.solver.cameras.multistart import carried, continued
 from pliant.solver.model.camera_motion_prior import (
     SCALE_FLOOR,
     STEADY,
@@ -20,6 +20,7 @@ from pliant.solver.model.camera_motion_prior import (
     scale_roughness,
 )
 from pliant.solver.model.marginal_likelihood import Motion, Scene, energy, start
+from pliant.solver.model.resection import rotations_between
 from pliant.solver.model.so3 import (
     exponential,
     exponential_and_jacobian,
@@ -198,6 +199,32 @@ def test_corrections_are_carried_to_the_frames_between() -> None:
     assert degrees_apart(found[used], truth[used]) < 1e-6
     assert degrees_apart(found, truth) < 0.01
     assert degrees_apart(truth @ exponential(-drift), truth) > 3
+
+
+def gram_of(rotations: np.ndarray) -> np.ndarray:
+    points = np.random.default_rng(1).normal(0, 0.5, (3, 200))
+    images = (rotations[:, :2] @ points).reshape(-1, 200)
+    return images @ images.T / 200
+
+
+def test_frames_between_are_interpolated_where_the_beginning_jitters() -> None:
+    truth, used = turning(41, 60), np.arange(0, 41, 4)
+    gram = gram_of(truth)
+    jitter = np.random.default_rng(0).normal(0, 0.4, (41, 3))
+    found = continued(gram, exponential(jitter) @ truth, truth[used], used)
+    np.testing.assert_array_equal(found, rotations_between(used, truth[used], 41))
+    assert (
+        degrees_apart(found, truth) < 3 < degrees_apart(carried(exponential(jitter) @ truth, truth[used], used), truth)
+    )
+
+
+def test_frames_between_are_carried_where_the_camera_moves_fast() -> None:
+    swing = np.radians(12) * np.sin(np.pi * np.arange(41) / 4)[:, None] * np.array([1.0, 0.0, 0.0])
+    truth, used = exponential(swing) @ turning(41, 60), np.arange(0, 41, 8)
+    gram = gram_of(truth)
+    np.testing.assert_array_equal(continued(gram, truth, truth[used], used), carried(truth, truth[used], used))
+    assert degrees_apart(rotations_between(used, truth[used], 41), truth) > 5
+    np.testing.assert_allclose(continued(gram, truth, truth, np.arange(41)), truth, atol=1e-12)
 
 
 @pytest.mark.slow

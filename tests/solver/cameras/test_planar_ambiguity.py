@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from camera_errors import degrees_apart
 from pliant.solver import Settings, Tracks, gallery, solve
+from pliant.solver.cameras import estimation
 from pliant.solver.cameras.estimation import estimate_cameras, with_other_cameras
 from pliant.solver.cameras.planar_ambiguity import (
     fitted,
@@ -169,3 +170,22 @@ def test_cameras_of_a_sheet_with_outliers_are_not_refined_jointly() -> None:
     assert "Then refined together" not in found.choices.reasons["rotations"]
     assert "Then refined together" in clean.choices.reasons["rotations"]
     assert metrics.e3d_frame(found.shapes, film.shapes) < 0.3
+
+
+def test_an_object_whose_poses_a_plane_does_not_change_is_treated_like_any_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tracks = normalize(gallery.face(8, 60).tracks)
+    usual = estimate_cameras(tracks, Settings())
+    monkeypatch.setattr(estimation, "is_planar", lambda gram: True)
+    monkeypatch.setattr(estimation, "resolve_pose_signs", lambda gram, rotations, **how: (rotations, None, "Kept."))
+    kept = estimate_cameras(tracks, Settings())
+    np.testing.assert_array_equal(kept.rotations, usual.rotations)
+    assert len(kept.candidates) == len(usual.candidates) > 0
+    assert len(kept.hypotheses) == len(usual.hypotheses)
+    mirrored = MIRROR @ usual.rotations @ MIRROR
+    monkeypatch.setattr(estimation, "resolve_pose_signs", lambda gram, rotations, **how: (mirrored, None, "Changed."))
+    changed = estimate_cameras(tracks, Settings())
+    assert changed.rotations is mirrored
+    assert not changed.candidates
+    assert not changed.hypotheses
