@@ -10,9 +10,9 @@ from pliant.solver.records import Floats
 
 
 def informative_frames(visible: Floats) -> NDArray[np.bool_]:
-    """Return a mask of the frames with at least 3 points and a quarter of the median number, shape `(F,)`; all if fewer than 3 qualify."""
+    """Return a mask of the frames with at least 3 points and a tenth of the median number, shape `(F,)`; all if fewer than 3 qualify."""
     seen = (visible > 0).sum(axis=1)
-    informative = np.asarray(seen >= max(3.0, 0.25 * float(np.median(seen[seen > 0]))))
+    informative = np.asarray(seen >= max(3.0, 0.1 * float(np.median(seen[seen > 0]))))
     return informative if informative.sum() >= 3 else np.ones(len(seen), dtype=bool)
 
 

@@ -181,8 +181,7 @@ def test_gross_outliers_are_rejected_and_reported(face: gallery.Sequence) -> Non
 def test_frames_with_few_visible_points_are_not_learned_from() -> None:
     visible = np.ones((10, 50))
     visible[3] = 0
-    visible[4, 12:] = 0
-    visible[5, 13:] = 0
+    visible[4, 4:] = 0
     assert informative_frames(visible).tolist() == [True] * 3 + [False] * 2 + [True] * 5
     assert informative_frames(np.eye(10)).all()
 
