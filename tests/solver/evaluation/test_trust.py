@@ -162,7 +162,11 @@ def test_a_result_without_reasons_against_it_is_good() -> None:
             "Almost no points are visible in 5 of 12 frames (the first is frame 7)",
         ),
         ({**CLOSE, "ordered": False}, Verdict.DO_NOT_USE, "In 2 of 12 frames, points"),
-        ({"planar": True}, Verdict.WITH_CARE, "The tracked surface is nearly flat, 45 % of its size off its plane"),
+        (
+            {"planar": True},
+            Verdict.WITH_CARE,
+            "The tracks are nearly those of a plane, and hardly show bending; the surface is 45 % of its size off its plane",
+        ),
         ({"depth_is_typical": True}, Verdict.WITH_CARE, "A turn of 60° hardly determines"),
         ({"modes": 7}, Verdict.WITH_CARE, "7 modes of deformation in 12 frames"),
         (
