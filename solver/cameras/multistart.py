@@ -195,8 +195,12 @@ def continued(
     ----------
     gram : shape (2F, 2F)
         W Wᵀ / P of the completed tracks.
-    rotations, best, used
-        As for `carried`.
+    rotations : shape (F, 3, 3)
+        Cameras of all frames that the search began from.
+    best : shape (F', 3, 3)
+        Cameras of the frames used, refined.
+    used : array of int
+        The frames used.
     should_stop : callable, optional
         Called after each iteration; once it returns True, the cameras so far are compared.
     """
