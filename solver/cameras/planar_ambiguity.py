@@ -136,7 +136,7 @@ def resolve_pose_signs(
         fits.append(fitted(part, begun[used], sizes, ordered=ordered, should_stop=should_stop))
     best = min(fits, key=lambda each: each.energy)
     found = _reverse_greedily(part, best, should_stop, ordered=ordered)
-    as_before = "The object is planar; its pose signs are unchanged."
+    as_before = "The tracks are nearly those of a plane; the pose signs are unchanged."
     if found is fits[0]:
         return rotations, None, as_before
     begun, _ = starts[fits.index(best)]
@@ -151,7 +151,7 @@ def resolve_pose_signs(
         return rotations, after, f"{as_before} Cameras with some poses reversed are an additional start."
     turn = float(np.degrees(angles_between(after, rotations).mean()))
     why = f"other pose signs are more probable; rotations change by {turn:.1f}° on average."
-    return after, None, f"The tracks are those of a sheet; {why}"
+    return after, None, f"The tracks are nearly those of a plane; {why}"
 
 
 def fitted(

@@ -353,7 +353,7 @@ def _model_signs(modes: int, frames: int, *, off: float | None, turn: float | No
         )
     if off is not None:
         found.append(
-            f"The tracks are nearly those of a plane, and hardly show bending; the surface is {_percent(off)} of its size off its plane."
+            f"The tracks are nearly those of a plane and hardly show bending; the surface is {_percent(off)} of its size off its plane."
         )
     if turn is not None:
         found.append(

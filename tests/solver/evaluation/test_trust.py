@@ -165,7 +165,7 @@ def test_a_result_without_reasons_against_it_is_good() -> None:
         (
             {"planar": True},
             Verdict.WITH_CARE,
-            "The tracks are nearly those of a plane, and hardly show bending; the surface is 45 % of its size off its plane",
+            "The tracks are nearly those of a plane and hardly show bending; the surface is 45 % of its size off its plane",
         ),
         ({"depth_is_typical": True}, Verdict.WITH_CARE, "A turn of 60° hardly determines"),
         ({"modes": 7}, Verdict.WITH_CARE, "7 modes of deformation in 12 frames"),
