@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from pliant.solver import KnownCamera, Settings, Tracks, estimate_cameras, gallery
-from pliant.solver.cameras.estimation import given_cameras
+from pliant.solver.cameras.estimation import CameraEstimate, given_cameras
 from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.model.expectation_maximisation import MAX_MODES
 from pliant.solver.reconstruction import cameras as reconstruction
@@ -15,7 +16,7 @@ from pliant.solver.records import Floats
 from pliant.solver.refinement.joint_refinement import refine_cameras
 from pliant.solver.refinement.learned import Refinement
 from pliant.solver.refinement.observed import Moments, Observed, cross_fitted, on_observations
-from pliant.solver.tracks.normalization import normalize
+from pliant.solver.tracks.normalization import Normalized, normalize
 
 MADE = gallery.face(20, 60, degrees=60)
 KNOWN = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
@@ -143,6 +144,25 @@ def test_outliers_are_kept_if_too_few_points_would_remain(monkeypatch: pytest.Mo
     found = estimate_cameras(tracks, KNOWN)
     assert np.array_equal(found.observations.normalized.points, normalize(tracks).points)
     assert 0.05 < found.outlier_share < 0.15
+
+
+def test_outliers_are_hidden_from_the_refinement_and_left_to_the_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Completion would follow some of them again, and so would the correction for perspective."""
+    made = gallery.corrupt(MADE, outliers=0.1, seed=1)
+    given, refine = [], reconstruction.refine_cameras
+
+    def spied(estimate: CameraEstimate, normalized: Normalized, *others: Any, **how: Any) -> object:
+        given.append(normalized)
+        return refine(estimate, normalized, *others, **how)
+
+    monkeypatch.setattr(reconstruction, "refine_cameras", spied)
+    found = estimate_cameras(made.tracks, KNOWN)
+    wrong = made.outliers & (
+        np.linalg.norm(made.tracks.points - MADE.tracks.points, axis=2) > 0.1 * normalize(MADE.tracks).unit
+    )
+    assert (given[0].visible[wrong] == 0).mean() > 0.98
+    assert (given[0].visible[~made.outliers] > 0).mean() > 0.98
+    assert (found.observations.normalized.visible == made.tracks.visible).all()
 
 
 @pytest.mark.slow
