@@ -21,6 +21,8 @@ from pliant.solver.settings import Settings
 from pliant.solver.tracks.noise import magnified, weighted_median
 from pliant.solver.tracks.normalization import Normalized
 
+Mask = NDArray[np.bool_]
+
 PAPER = Weights(temporal=1e-3, spatial=1.0, low_rank=0.0, robust_scale=1e-3, order=1)
 """Values of Dai, Deng, He (2017), section 5: λ1 = 1e-3, λ2 = 1, first order, no low-rank prior; unit: the tracks' RMS radius."""
 
@@ -158,11 +160,17 @@ def relative_weight(settings: Settings, scale: float) -> float:
     return min(1.0, wider if settings.loss == "huber" else 1 / wider)
 
 
-def bending_weight(temporal: float, laplacian: Laplacian, shapes: NDArray[np.floating], modes: int) -> float:
-    """Return λ2 that preserves about the bending of shapes `(F, 3, P)` found without it; `modes` counts the mean shape as well."""
+def bending_weight(
+    temporal: float, laplacian: Laplacian, shapes: NDArray[np.floating], modes: int, *, inside: Mask | None = None
+) -> float:
+    """Return λ2 that preserves about the bending of shapes `(F, 3, P)` found without it.
+
+    `modes` counts the mean shape as well. `inside`, shape `(P,)`, are the points whose bending counts; the default is all.
+    """
+    counted = np.ones(shapes.shape[2], dtype=bool) if inside is None else inside
     flat = shapes.reshape(-1, shapes.shape[2])
-    bends = np.asarray(laplacian.matrix @ flat.T, dtype=np.float64)
-    rows = float((np.diff(laplacian.matrix.indptr) > 0).mean())
+    bends = np.asarray(laplacian.matrix @ flat.T, dtype=np.float64)[counted]
+    rows = float((np.diff(laplacian.matrix.indptr) > 0)[counted].mean())
     share = BENDING_SHARE * min(1.0, BENDING_MODES * modes / len(shapes))
     return share * temporal * rows / max(float(np.mean(bends**2)), np.finfo(float).tiny)
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.energy.hyperparameters import bending_weight
 from pliant.solver.evaluation.trust import Trust
 from pliant.solver.limits import BLOCK_OBSERVATIONS
 from pliant.solver.mesh import Mesh
@@ -34,8 +35,8 @@ from pliant.solver.storage import allocated, let_go
 
 MARGIN = 4
 """Rings of neighbours around a block. For a face of 20 × 4,000 in four blocks with 2, 4, 8 and 16 rings, shapes differ from those solved at
-once by .0011, .0010, .0010 and .0010 of its size (RMS), with the smooth prior by .0032, .0031, .0032 and .0033; for 20 × 20,000 by .0003
-and .0033 with any of them. The remaining difference comes from where the reweightings end."""
+once by .00024, .00004, .00002 and .00002 of its size (RMS), for 20 × 20,000 by .00032, .00018, .00004 and .00005; with the smooth prior by
+.003 to .004 with any of them, because of where the reweightings end."""
 
 JUDGED_POINTS = 20_000
 """Maximum number of points, at equal steps of the index, from which the verdict on the result is computed."""
@@ -103,22 +104,30 @@ def _bending(
 ) -> float | None:
     """Return λ2 of the whole surface from the initial shapes of all blocks; None if it is not estimated.
 
-    λ2 is the inverse of a mean over the points, which a few sharp features dominate, so a sample of the points would not suffice.
+    λ2 is the inverse of a mean over the points, which a few sharp features dominate, so a sample would not suffice. Each block
+    has its margin here, too: without its neighbours, the surface bends less at the border.
     """
     if mesh is None or prior is None or settings.spatial_weight is not None:
         return None
-    total = 0.0
+    total, count = 0.0, 0
     for number, own in enumerate(groups):
-        part, surface = _part(tracks, own), mesh_of(mesh, own)
-        weight = prepared(
-            part, cameras, prior, surface, settings, moving=False, should_stop=monitor
-        ).problem.weights.spatial
-        if monitor.stopped or not weight > 0:
+        kept = with_margin(own, mesh.edges, tracks.num_points)
+        start = prepared(
+            _part(tracks, kept), cameras, prior, mesh_of(mesh, kept), settings, moving=False, should_stop=monitor
+        )
+        laplacian, quadratic, seen = start.problem.laplacian, start.problem.quadratic, start.part
+        if monitor.stopped or laplacian is None or quadratic is None:
             return None
-        total += len(own) / weight
+        inside = np.isin(kept if seen is None else kept[seen.kept], own)
+        if not inside.any():  # points that hardly any frame shows
+            continue
+        modes = quadratic.modes[0].shape[1]
+        weight = bending_weight(start.problem.weights.temporal, laplacian, start.state.shapes, modes, inside=inside)
+        total, count = total + inside.sum() / weight, count + int(inside.sum())
+        del start, laplacian, quadratic, seen  # before the next block
         monitor.report_block(Step("initialise", 0.0), START_SHARE * (number + 1) / len(groups))
         let_go(tracks.points, tracks.visible)
-    return tracks.num_points / total
+    return count / total if count else None
 
 
 def blocks(tracks: Tracks, count: int) -> list[NDArray[np.intp]]:
