@@ -151,7 +151,7 @@ def _judged(points: Floats, projections: Floats, way: Schedule, seed: int, shoul
 def _rounds(gram: Floats, projections: Floats, model_order: ModelOrder, floors: Floats) -> Iterator[ShapeCovariance]:
     """Yield the covariance after every round from scratch."""
     start = scratch(gram, projections, model_order)
-    return rounds(start, gram, projections, model_order, floors=floors)
+    return rounds(start, gram, projections, floors=floors, max_modes=model_order.max_modes)
 
 
 def _last(covariances: Iterator[ShapeCovariance]) -> ShapeCovariance:

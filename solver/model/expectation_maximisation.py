@@ -48,10 +48,6 @@ MEAN_MODE_STD = 0.3
 START_NOISE_VARIANCE = 1e-5
 """σ² at the start, normalized units squared: below that of any tracker."""
 
-ISOTROPY = 0.05
-"""Weight of the prior on A₁ when the covariance for the shapes is learned. The likelihood hardly determines A₁ along a depth that the
-cameras do not show. Errors with .001, .05, .2 and 1: a horse .058, .053, .051, .053; a shark .0073, .0055, .0051, .0055; a dance .090,
-.089, .089, .087; a walk .102, .104, .107, .106. On 30 sequences that it was not chosen on, errors are .995 times those with .001."""
 
 MAX_DENSE_FRAMES = 160
 """Maximum number of frames for which an EM round works on dense 2F×2F matrices, which is then the faster form."""
@@ -62,7 +58,7 @@ GUARD_VECTORS = 8
 
 @dataclass(frozen=True, slots=True)
 class ModelOrder:
-    """Limits and prior with which the covariance is learned."""
+    """Limits with which the covariance is learned."""
 
     max_modes: int = MAX_MODES
     """Maximum number of modes, the columns of L."""
@@ -72,9 +68,6 @@ class ModelOrder:
 
     ordered: bool = True
     """True for a film, False for photographs in no order."""
-
-    isotropy: float = AXIS_VARIANCE_FLOOR
-    """Weight, relative to the data, of an inverse Wishart prior on A₁ whose mode is the identity."""
 
 
 def learned(
@@ -105,11 +98,12 @@ def learned(
         Called after every round; once it returns True, the best so far is returned.
     """
     count = min(iterations, max(MIN_ITERATIONS, ITERATION_FRAMES // len(projections)))
+    max_modes = model_order.max_modes
     warm = freed(annealed(gram, projections, model_order, iterations=count, should_stop=should_stop))
     cold = scratch(gram, projections, model_order)
     runs = (
-        improve(warm, gram, projections, model_order, iterations=count // 2, should_stop=should_stop),
-        improve(cold, gram, projections, model_order, iterations=count, should_stop=should_stop),
+        improve(warm, gram, projections, iterations=count // 2, max_modes=max_modes, should_stop=should_stop),
+        improve(cold, gram, projections, iterations=count, max_modes=max_modes, should_stop=should_stop),
     )
     return min(runs, key=lambda run: run.nll)
 
@@ -124,8 +118,8 @@ def annealed(
 ) -> ShapeCovariance:
     """Return the covariance after `iterations` annealed rounds from scratch."""
     return improve(
-        scratch(gram, projections, model_order), gram, projections, model_order,
-        iterations=iterations, warm=ANNEALING_START, should_stop=should_stop,
+        scratch(gram, projections, model_order), gram, projections, iterations=iterations, warm=ANNEALING_START,
+        max_modes=model_order.max_modes, should_stop=should_stop,
     )  # fmt: skip
 
 
@@ -171,18 +165,18 @@ def improve(
     covariance: ShapeCovariance,
     gram: Floats,
     projections: Floats,
-    model_order: ModelOrder,
     *,
     iterations: int,
     warm: float = WALK_VARIANCE_FLOOR,
+    max_modes: int = MAX_MODES,
     should_stop: ShouldStop = never,
 ) -> ShapeCovariance:
     """Return the covariance after rounds of EM with a floor of τ that falls from `warm` to `WALK_VARIANCE_FLOOR`.
 
-    At a constant floor the likelihood never decreases, apart from the effect of the prior on A₁.
+    At a constant floor the likelihood never decreases.
     """
     floors = np.geomspace(warm, WALK_VARIANCE_FLOOR, iterations)
-    for better in rounds(covariance, gram, projections, model_order, floors=floors):
+    for better in rounds(covariance, gram, projections, floors=floors, max_modes=max_modes):
         covariance = better
         if should_stop():
             break
@@ -190,7 +184,7 @@ def improve(
 
 
 def rounds(
-    covariance: ShapeCovariance, gram: Floats, projections: Floats, model_order: ModelOrder, *, floors: Floats
+    covariance: ShapeCovariance, gram: Floats, projections: Floats, *, floors: Floats, max_modes: int
 ) -> Iterator[ShapeCovariance]:
     """Yield the covariance after every round of EM, each with its floor of τ.
 
@@ -202,15 +196,15 @@ def rounds(
     factor, subspace = factor_of(gram), None
     for number, floor in enumerate(floors):
         if len(projections) <= MAX_DENSE_FRAMES:
-            covariance = _round(covariance, factor, projections, floor, model_order)
+            covariance = _round(covariance, factor, projections, floor, max_modes)
         else:
-            covariance, subspace = _linear_round(covariance, factor, projections, floor, model_order, subspace)
+            covariance, subspace = _linear_round(covariance, factor, projections, floor, max_modes, subspace)
             subspace = np.hstack([subspace, _cosines(len(projections), GUARD_VECTORS, first=number * GUARD_VECTORS)])
         yield covariance
 
 
 def _round(
-    covariance: ShapeCovariance, factor: Floats, projections: Floats, floor: float, model_order: ModelOrder
+    covariance: ShapeCovariance, factor: Floats, projections: Floats, floor: float, max_modes: int
 ) -> ShapeCovariance:
     """Return the covariance after one round with dense K."""
     frames = len(projections)
@@ -231,7 +225,7 @@ def _round(
     paired = deform[0::2] + deform[1::2]
     moved = paired[:, 0::2] + paired[:, 1::2]
     modes, walk_variance = _split(
-        over_frames + over_frames @ moved @ over_frames / 3, floor, model_order.max_modes, ordered=covariance.ordered
+        over_frames + over_frames @ moved @ over_frames / 3, floor, max_modes, ordered=covariance.ordered
     )
     return _improved(
         covariance, modes, walk_variance,
@@ -239,7 +233,6 @@ def _round(
         axis_covariance=covariance.axis_covariance + by_axes.T @ wide @ by_axes / frames,
         surplus=float(surplus.trace()) / (2 * frames),
         nll=0.5 * (log_det + float(np.vdot(explained, factor))) / frames,
-        isotropy=model_order.isotropy,
     )  # fmt: skip
 
 
@@ -248,7 +241,7 @@ def _linear_round(
     factor: Floats,
     projections: Floats,
     floor: float,
-    model_order: ModelOrder,
+    max_modes: int,
     subspace: Floats | None,
 ) -> tuple[ShapeCovariance, Floats]:
     """Return the covariance after one round in time linear in the frames, and the subspace for the next round.
@@ -257,7 +250,7 @@ def _linear_round(
     rootᵀ C root, the modes are the leading eigenvectors of C̃ + C̃ m C̃/3, of which only products and the trace are
     needed: one Nyström step per round, from the eigenvectors of the previous round and `GUARD_VECTORS` more.
     """
-    (frames, count), max_modes = covariance.modes.shape, model_order.max_modes
+    frames, count = covariance.modes.shape
     root0, root1 = root_matrix(covariance.mean_covariance), root_matrix(covariance.axis_covariance)
     model = covariance.image_model(projections)
     walk, columns = model.walk, model.columns.reshape(frames, 2, count + 1, 3)
@@ -283,7 +276,7 @@ def _linear_round(
         mean_covariance=root0 @ (np.eye(3) + mean_moments) @ root0.T,
         axis_covariance=root1 @ (np.eye(3) + axis_moments / frames) @ root1.T,
         surplus=-found.by_noise_variance,
-        nll=found.value, isotropy=model_order.isotropy,
+        nll=found.value,
     )  # fmt: skip
     return better, vectors[:, : modes.shape[1] + GUARD_VECTORS]
 
@@ -346,13 +339,12 @@ def _improved(
     axis_covariance: Floats,
     surplus: float,
     nll: float,
-    isotropy: float,
 ) -> ShapeCovariance:
     """Return the covariance with new moments; `surplus` is the mean of K's diagonal, `nll` that of the previous covariance."""
     return ShapeCovariance(
         mean_covariance=_symmetric(mean_covariance),
-        axis_covariance=_symmetric(axis_covariance * (3 / axis_covariance.trace()) + isotropy * IDENTITY)
-        / (1 + isotropy),
+        axis_covariance=_symmetric(axis_covariance * (3 / axis_covariance.trace()) + AXIS_VARIANCE_FLOOR * IDENTITY)
+        / (1 + AXIS_VARIANCE_FLOOR),
         modes=modes,
         walk_variance=walk_variance,
         noise_variance=max(covariance.noise_variance * (1 + covariance.noise_variance * surplus), NOISE_VARIANCE_FLOOR),

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.model.early_stopping import described, learn_with_early_stopping
-from pliant.solver.model.expectation_maximisation import ISOTROPY, ModelOrder
+from pliant.solver.model.expectation_maximisation import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import enter
 from pliant.solver.pulse import ShouldStop
@@ -69,12 +69,7 @@ def learn_covariance(
         # Learn from scratch: modes learned along the way to these cameras overstate their likelihood.
         enter(should_stop, "covariance")
         covariance, modes = learn_with_early_stopping(
-            data.sample,
-            data.gram,
-            data.projections,
-            replace(data.model_order, isotropy=ISOTROPY),
-            seed=seed,
-            should_stop=should_stop,
+            data.sample, data.gram, data.projections, data.model_order, seed=seed, should_stop=should_stop
         )
     if len(data.used) < len(estimate.rotations):
         covariance = covariance.stretched(data.used, len(estimate.rotations))

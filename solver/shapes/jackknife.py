@@ -127,12 +127,12 @@ def learning_changes(
         points = points_of(sample.expected(start, every)[0])
         order = ModelOrder(ordered=covariance.ordered)
         early = schedule(points, start.projections, order, seed=seed, should_stop=should_stop)
-        part_of, everything = parts(points), _shapes_from(sample, every, start, order, early, turning)
+        part_of, everything = parts(points), _shapes_from(sample, every, start, early, turning)
         for part in np.unique(part_of):
             if should_stop():
                 return nothing
             if (part_of != part).sum() >= MIN_POINTS:
-                without.append(_onto(_shapes_from(sample, part_of != part, start, order, early, turning), everything))
+                without.append(_onto(_shapes_from(sample, part_of != part, start, early, turning), everything))
     except np.linalg.LinAlgError:  # depth is unbounded
         return replace(nothing, bounded=False)
     if len(without) < 2:
@@ -188,7 +188,7 @@ def _mean_squared_change(without: Floats, everything: Floats) -> Floats:
 
 
 def _shapes_from(
-    sample: _Sample, kept: NDArray[np.bool_], start: Learned, order: ModelOrder, early: Schedule | None, turning: bool
+    sample: _Sample, kept: NDArray[np.bool_], start: Learned, early: Schedule | None, turning: bool
 ) -> Floats:
     """Return posterior mean shapes `(F', S, 3)` in camera axes, with cameras and covariance refined from the points kept."""
     gram = sample.expected(start, kept)[1]
@@ -196,9 +196,7 @@ def _shapes_from(
     def relearned(found: Learned) -> Learned:
         projections = found.projections
         if early is None:
-            return replace(
-                found, covariance=improve(found.covariance, gram, projections, order, iterations=LEARNING_ROUNDS)
-            )
+            return replace(found, covariance=improve(found.covariance, gram, projections, iterations=LEARNING_ROUNDS))
         return replace(found, covariance=early.learned(gram, projections))
 
     found = relearned(start)

@@ -168,7 +168,6 @@ def test_every_round_of_em_pulses(most_dense: int, monkeypatch: pytest.MonkeyPat
             expectation_maximisation.scratch(gram, projections, expectation_maximisation.ModelOrder()),
             gram,
             projections,
-            expectation_maximisation.ModelOrder(),
             iterations=7,
         )
     assert len(pulses) >= 7

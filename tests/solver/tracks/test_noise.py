@@ -82,7 +82,7 @@ def test_the_camera_prior_is_weaker_with_strong_noise() -> None:
 
 def test_strong_noise_is_learned_though_a_small_start_misses_it() -> None:
     gram = gram_of(tracks(500, modes=2, sigma=SIGMA))
-    small = improve(scratch(gram, PAIRS, ModelOrder()), gram, PAIRS, ModelOrder(), iterations=60, warm=ANNEALING_START)
+    small = improve(scratch(gram, PAIRS, ModelOrder()), gram, PAIRS, iterations=60, warm=ANNEALING_START)
     assert small.noise_variance**0.5 < SIGMA / 3
     assert learned(gram, PAIRS, ModelOrder(8, noisy_start=True)).noise_variance ** 0.5 == pytest.approx(SIGMA, rel=0.15)
 
