@@ -35,7 +35,7 @@ from pliant.solver.storage import allocated, let_go
 
 MARGIN = 4
 """Rings of neighbours around a block. For a face of 20 × 4,000 in four blocks with 2, 4, 8 and 16 rings, shapes differ from those solved at
-once by .00024, .00004, .00002 and .00002 of its size (RMS), for 20 × 20,000 by .00032, .00018, .00004 and .00005; with the smooth prior by
+once by .00020, .00005, .00004 and .00004 of its size (RMS), for 20 × 20,000 by .00027, .00015, .00005 and .00005; with the smooth prior by
 .003 to .004 with any of them, because of where the reweightings end."""
 
 JUDGED_POINTS = 20_000
