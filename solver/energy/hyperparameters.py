@@ -21,8 +21,6 @@ from pliant.solver.settings import Settings
 from pliant.solver.tracks.noise import magnified, weighted_median
 from pliant.solver.tracks.normalization import Normalized
 
-Mask = NDArray[np.bool_]
-
 PAPER = Weights(temporal=1e-3, spatial=1.0, low_rank=0.0, robust_scale=1e-3, order=1)
 """Values of Dai, Deng, He (2017), section 5: λ1 = 1e-3, λ2 = 1, first order, no low-rank prior; unit: the tracks' RMS radius."""
 
@@ -161,18 +159,23 @@ def relative_weight(settings: Settings, scale: float) -> float:
 
 
 def bending_weight(
-    temporal: float, laplacian: Laplacian, shapes: NDArray[np.floating], modes: int, *, inside: Mask | None = None
+    temporal: float,
+    laplacian: Laplacian,
+    shapes: NDArray[np.floating],
+    modes: int,
+    *,
+    bends: NDArray[np.bool_] | None = None,
 ) -> float:
     """Return λ2 that preserves about the bending of shapes `(F, 3, P)` found without it.
 
-    `modes` counts the mean shape as well. `inside`, shape `(P,)`, are the points whose bending counts; the default is all.
+    `modes` counts the mean shape as well. Only the points `bends`, shape `(P,)`, count; all do by default, or if there are none.
     """
-    counted = np.ones(shapes.shape[2], dtype=bool) if inside is None else inside
+    counted = np.ones(shapes.shape[2], dtype=bool) if bends is None or not bends.any() else bends
     flat = shapes.reshape(-1, shapes.shape[2])
-    bends = np.asarray(laplacian.matrix @ flat.T, dtype=np.float64)[counted]
+    bent = np.asarray(laplacian.matrix @ flat.T, dtype=np.float64)[counted]
     rows = float((np.diff(laplacian.matrix.indptr) > 0)[counted].mean())
     share = BENDING_SHARE * min(1.0, BENDING_MODES * modes / len(shapes))
-    return share * temporal * rows / max(float(np.mean(bends**2)), np.finfo(float).tiny)
+    return share * temporal * rows / max(float(np.mean(bent**2)), np.finfo(float).tiny)
 
 
 def _from_data(rough: Roughness, settings: Settings) -> tuple[Weights, str]:

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.energy.hyperparameters import bending_weight
 from pliant.solver.evaluation.trust import Trust
 from pliant.solver.limits import BLOCK_OBSERVATIONS
 from pliant.solver.mesh import Mesh
@@ -104,30 +103,24 @@ def _bending(
 ) -> float | None:
     """Return λ2 of the whole surface from the initial shapes of all blocks; None if it is not estimated.
 
-    λ2 is the inverse of a mean over the points, which a few sharp features dominate, so a sample would not suffice. Each block
-    has its margin here, too: without its neighbours, the surface bends less at the border.
+    λ2 is the inverse of a mean over the points, which a few sharp features dominate, so a sample would not suffice. Blocks
+    have their margins here, too: without its neighbours, the surface seems to bend less at the border.
     """
     if mesh is None or prior is None or settings.spatial_weight is not None:
         return None
-    total, count = 0.0, 0
+    total = 0.0
     for number, own in enumerate(groups):
         kept = with_margin(own, mesh.edges, tracks.num_points)
-        start = prepared(
-            _part(tracks, kept), cameras, prior, mesh_of(mesh, kept), settings, moving=False, should_stop=monitor
-        )
-        laplacian, quadratic, seen = start.problem.laplacian, start.problem.quadratic, start.part
-        if monitor.stopped or laplacian is None or quadratic is None:
+        weight = prepared(
+            _part(tracks, kept), cameras, prior, mesh_of(mesh, kept), settings, moving=False, bends=np.isin(kept, own),
+            should_stop=monitor,
+        ).problem.weights.spatial  # fmt: skip
+        if monitor.stopped or not weight > 0:
             return None
-        inside = np.isin(kept if seen is None else kept[seen.kept], own)
-        if not inside.any():  # points that hardly any frame shows
-            continue
-        modes = quadratic.modes[0].shape[1]
-        weight = bending_weight(start.problem.weights.temporal, laplacian, start.state.shapes, modes, inside=inside)
-        total, count = total + inside.sum() / weight, count + int(inside.sum())
-        del start, laplacian, quadratic, seen  # before the next block
+        total += len(own) / weight
         monitor.report_block(Step("initialise", 0.0), START_SHARE * (number + 1) / len(groups))
         let_go(tracks.points, tracks.visible)
-    return count / total if count else None
+    return tracks.num_points / total
 
 
 def blocks(tracks: Tracks, count: int) -> list[NDArray[np.intp]]:

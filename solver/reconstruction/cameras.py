@@ -132,7 +132,7 @@ def cameras_of(observations: Observations, monitor: Monitor) -> Cameras:
         observations, estimate = _without_outliers(estimate, observations, part, used, monitor)
         part = observations.at(used) if long else observations
     estimate, data = _with_shapes(estimate, part, monitor)
-    if has_outliers:  # the shapes decide again, with weights of their own
+    if has_outliers:  # every observation is judged again when the shapes are computed
         observations = observations.with_all()
     if long:
         assert data is not None

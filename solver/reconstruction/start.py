@@ -157,11 +157,13 @@ def prepared(
     *,
     moving: bool,
     bending: float | None = None,
+    bends: NDArray[np.bool_] | None = None,
     should_stop: ShouldStop,
 ) -> Start:
     """Return the start of the minimisation, before outlier rejection; less converged once `should_stop` returns True.
 
-    `moving` is as in `Problem`; `bending` is λ2 if automatic in the settings, None to compute it from the initial shapes.
+    `moving` is as in `Problem`; `bending` is λ2 if automatic in the settings, None to compute it from the initial shapes of the points
+    `bends`, shape `(P,)`, by default of all.
 
     Raises
     ------
@@ -191,7 +193,9 @@ def prepared(
     should_stop()
     return Start(
         observations, mesh, settings, flat, estimate, covariance, cameras.outlier_share, part,
-        *with_bending(problem, choices, state, settings, bending=bending),
+        *with_bending(
+            problem, choices, state, settings, bending=bending, bends=bends if bends is None or part is None else bends[part.kept]
+        ),
     )  # fmt: skip
 
 

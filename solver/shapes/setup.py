@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.energy.hyperparameters import bending_weight, choose_weights
 from pliant.solver.energy.problem import Problem
@@ -59,14 +60,20 @@ def build_problem(
 
 
 def with_bending(
-    problem: Problem, choices: Choices, state: State, settings: Settings, *, bending: float | None
+    problem: Problem,
+    choices: Choices,
+    state: State,
+    settings: Settings,
+    *,
+    bending: float | None,
+    bends: NDArray[np.bool_] | None = None,
 ) -> tuple[Problem, Choices, State]:
-    """Set λ2 if it is automatic and the prior is Gaussian: to `bending`, or from the bending of the current shapes if None."""
+    """Set λ2 if it is automatic and the prior is Gaussian: to `bending`, or from the current shapes of the points `bends` if None."""
     if problem.quadratic is None or problem.laplacian is None or settings.spatial_weight is not None:
         return problem, choices, state
     modes = problem.quadratic.modes[0].shape[1]
     if bending is None:
-        weight = bending_weight(problem.weights.temporal, problem.laplacian, state.shapes, modes)
+        weight = bending_weight(problem.weights.temporal, problem.laplacian, state.shapes, modes, bends=bends)
     else:
         weight = bending
     problem = replace(problem, weights=replace(problem.weights, spatial=weight))

@@ -63,6 +63,8 @@ def test_solving_in_blocks_matches_solving_at_once(film: gallery.Sequence, setti
     assert np.sqrt(np.square(apart).mean()) < 3e-3 * size
     error, expected = (metrics.e3d_frame(each.shapes, film.shapes) for each in (solution, whole))
     assert error < 1.01 * expected + 1e-4
+    if settings.prior == "gaussian":  # the smooth prior takes it from the noise of each block
+        assert solution.choices.spatial_weight == pytest.approx(whole.choices.spatial_weight, rel=0.01)
     assert solution.shapes.mean(axis=1) == pytest.approx(np.zeros((FRAMES, 3)), abs=1e-9)
     image = solution.camera.project(solution.shapes)
     assert np.linalg.norm(image - film.tracks.points, axis=2) == pytest.approx(solution.residuals, abs=1e-6)

@@ -65,3 +65,7 @@ def test_the_weight_of_bending_follows_the_surface_and_the_modes() -> None:
     assert bending_weight(0.5, laplacian, shapes, 5) == pytest.approx(whole / 2)
     assert bending_weight(0.5, laplacian, 3 * shapes, 10) == pytest.approx(whole / 9)
     assert bending_weight(1.0, laplacian, shapes, 10) == pytest.approx(2 * whole)
+    assert bending_weight(0.5, laplacian, shapes, 10, bends=np.zeros(42, dtype=bool)) == whole
+    one, other = (bending_weight(0.5, laplacian, shapes, 10, bends=np.arange(42) % 2 == parity) for parity in (0, 1))
+    assert one != pytest.approx(other)
+    assert 2 / (1 / one + 1 / other) == pytest.approx(whole), "inverse weights are means over the points"
