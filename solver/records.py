@@ -376,10 +376,12 @@ def _positive_scales(scales: ArrayLike, frames: int) -> Floats:
     factors = np.array(numeric(scales, "scales", hint), dtype=np.float64)
     if factors.shape != (frames,):
         raise wrong_input("scales", "wrong_shape", f"{frames} numbers", shape_text(factors), hint)
-    if not (np.isfinite(factors) & (factors > 0)).all():
-        smallest = float(factors.min())
-        got = "a value that is not finite" if not np.isfinite(factors).all() else f"{smallest:.3g}"
-        raise wrong_input("scales", "out_of_range", "positive, finite numbers", got, hint)
+    within = (factors >= 1 / MAX_COORDINATE) & (
+        factors <= MAX_COORDINATE
+    )  # False for NaN; beyond, files in single precision overflow
+    if not within.all():
+        expected = f"positive numbers from {1 / MAX_COORDINATE:g} to {MAX_COORDINATE:g}"
+        raise wrong_input("scales", "out_of_range", expected, f"{factors[~within][0]:.3g}", hint)
     ratio = float(factors.max() / factors.min())
     if not ratio <= MAX_SCALE_RATIO:
         raise wrong_input(

@@ -213,6 +213,13 @@ def _from_polygon(given: ArrayLike, size: tuple[int, int]) -> Grey:
     outline = np.round(corners).astype(np.int64)
     mask = np.where(_turns(outline, size) != 0, 255, 0).astype(np.uint8)
     cv2.fillPoly(mask, [outline.astype(np.int32)], 255)  # adds the outline itself
+    if not mask.any():
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        raise _refusal(
+            "empty_region", f"a polygon around some pixels of the film, which has {size[0]}×{size[1]}",
+            f"x from {low[0]:g} to {high[0]:g} and y from {low[1]:g} to {high[1]:g}, outside the picture",
+            "Give corners in the film's own pixels, not in those of an enlarged picture.",
+        )  # fmt: skip
     return mask
 
 

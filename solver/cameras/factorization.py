@@ -68,9 +68,9 @@ def upgrade(gram: Floats, basis_size: int) -> Upgrade:
 
 
 def upgrades(gram: Floats, basis_sizes: Iterable[int]) -> Iterator[Upgrade]:
-    """Yield the cameras of `upgrade` for every K, from one eigendecomposition."""
+    """Yield the cameras of `upgrade` for every K, if there are any, from one eigendecomposition."""
     sizes = tuple(basis_sizes)
-    values, vectors = leading_eigenpairs(gram, 3 * max(sizes))
+    values, vectors = leading_eigenpairs(gram, 3 * max(sizes, default=0))
     for basis_size in sizes:
         yield _upgraded(_leading(values, vectors, 3 * basis_size), basis_size)
 

@@ -90,7 +90,8 @@ def learn_with_early_stopping(
     early = schedule(sample, projections, model_order, seed=seed, should_stop=should_stop)
     if early is not None:
         covariance = early.learned(gram, projections)
-        reason = f"learned in {len(early.floors)} rounds; more would make held-out points less probable."
+        rounds = "1 round" if len(early.floors) == 1 else f"{len(early.floors)} rounds"
+        reason = f"learned in {rounds}; more would make held-out points less probable."
         return covariance, described(covariance, reason)
     covariance = learned(gram, projections, model_order, should_stop=should_stop)
     reason = (
@@ -127,7 +128,8 @@ def schedule(
 
 def described(covariance: ShapeCovariance, more: str = "") -> str:
     """Return a sentence with the number of modes and the noise."""
-    found = f"{covariance.modes.shape[1]} modes of deformation, noise of {covariance.noise_variance**0.5:.2g} RMS radii"
+    count = covariance.modes.shape[1]
+    found = f"{count} mode{'' if count == 1 else 's'} of deformation, noise of {covariance.noise_variance**0.5:.2g} RMS radii"
     return f"{found}; {more}" if more else f"{found}."
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-import numpy as np
 from pliant.solver.agreement import check_mesh, check_tracks
 from pliant.solver.errors import singular_refused
 from pliant.solver.mesh import Mesh
@@ -17,7 +16,7 @@ from pliant.solver.reconstruction.observations import OnStep, monitored
 from pliant.solver.reconstruction.prior import Prior, changes_of
 from pliant.solver.reconstruction.shapes import shapes_from
 from pliant.solver.reconstruction.solution import in_world_unit
-from pliant.solver.reconstruction.start import begin, check_shapes, check_types, without_learned_prior
+from pliant.solver.reconstruction.start import begin, check_types, start_shapes, without_learned_prior
 from pliant.solver.records import Floats, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.solution import Solution
@@ -53,7 +52,8 @@ def solve_shapes(
     settings : Settings, optional
         Method, loss, weights; None uses the settings of the cameras.
     start : Solution or ndarray, shape (F, P, 3), optional
-        Initial shapes, world axes, the tracks' unit; None starts from least squares. The energy is the same either way.
+        Initial shapes, world axes, the tracks' unit; None, or shapes of higher energy, start from least squares. The energy minimised is
+        the same either way.
     scratch : path, optional
         Folder for a temporary file that holds the result if the shapes are solved in blocks, as for `solve`.
     on_step : callable, optional
@@ -64,7 +64,8 @@ def solve_shapes(
     Raises
     ------
     InvalidInput
-        Mesh, cameras, prior or start do not match the tracks, these are no valid `Tracks`, or an argument has another type.
+        Mesh, cameras, prior or start do not match the tracks, start is absurdly large, the tracks are no valid `Tracks`, or an argument
+        has another type.
     InvalidSettings
         The settings select another prior than the given one, or require a mesh that is a grid.
     NotFinite
@@ -75,9 +76,9 @@ def solve_shapes(
     check_tracks(tracks)
     check_types(cameras, prior, mesh, settings)
     observations = cameras.observations.of(tracks)
-    first = None if start is None else np.asarray(start.shapes if isinstance(start, Solution) else start, dtype=float)
-    if first is not None:
-        check_shapes(first, tracks)
+    first = (
+        None if start is None else start_shapes(start.shapes if isinstance(start, Solution) else start, observations)
+    )
     settings = settings if settings is not None else observations.settings
     check_mesh(tracks, mesh, settings)
     settings = without_learned_prior(settings) if prior is None else settings

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pliant.solver.agreement import MAKE_MESH, MAKE_SETTINGS, check_mesh, check_tracks, check_type
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import orthographic
 from pliant.solver.energy.problem import Problem
-from pliant.solver.errors import InvalidInput, InvalidSettings, singular_refused
+from pliant.solver.errors import InvalidInput, InvalidSettings, numeric, shape_text, singular_refused, wrong_input
+from pliant.solver.limits import MAX_COORDINATE
 from pliant.solver.mesh import Mesh
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor
@@ -141,7 +142,7 @@ def begin(
 ) -> Start:
     """Return the start of the minimisation with gross outliers rejected; parameters and errors as for `prepared` and `warm`.
 
-    The initial shapes are `shapes`, if given, and least-squares ones otherwise.
+    The initial shapes are `shapes`, if given and of lower energy, and least-squares ones otherwise.
     """
     start = prepared(tracks, cameras, prior, mesh, settings, moving=moving, bending=bending, should_stop=monitor)
     start = _without_outliers(start, monitor)
@@ -223,19 +224,16 @@ def _initial(problem: Problem, estimate: CameraEstimate, settings: Settings, sho
 
 
 def warm(start: Start, shapes: Floats) -> Start:
-    """Return the start with its state at given shapes `(F, P, 3)`, world axes, the tracks' unit.
+    """Return the start with its state at given shapes `(F, P, 3)`, world axes, the tracks' unit, if their energy is lower.
 
-    Raises
-    ------
-    InvalidInput
-        The array has the wrong shape or contains values that are not finite.
+    From absurdly large shapes, whose residuals leave the observations hardly any weight, the minimisation would stop far from the minimum.
     """
-    check_shapes(shapes, start.observations.tracks)
     part = shapes if start.kept is None else shapes[:, start.kept]
     problem = start.problem
     coordinates = (part / start.flat.unit) @ np.linalg.inv(problem.axes).T
     there = np.ascontiguousarray(coordinates.transpose(0, 2, 1), dtype=problem.points.dtype)
-    return replace(start, state=init(problem, there, start.state.translations))
+    given = init(problem, there, start.state.translations)
+    return replace(start, state=given) if given.objective < start.state.objective else start
 
 
 def check_types(cameras: Cameras, prior: Prior | None, mesh: Mesh | None, settings: Settings | None) -> None:
@@ -256,20 +254,33 @@ def check_types(cameras: Cameras, prior: Prior | None, mesh: Mesh | None, settin
             check_type(field, value, kind, make)
 
 
-def check_shapes(shapes: Floats, tracks: Tracks) -> None:
-    """Check that initial shapes match the tracks.
+def start_shapes(start: ArrayLike, observations: Observations) -> Floats:
+    """Return initial shapes as an array after checking that they match the tracks.
+
+    Parameters
+    ----------
+    start : array_like, shape (F, P, 3)
+        World axes and unit.
+    observations : Observations
+        The tracks.
 
     Raises
     ------
     InvalidInput
-        The array has the wrong shape or contains values that are not finite.
+        The array has the wrong type or shape, or a coordinate is not finite or beyond `MAX_COORDINATE` RMS radii of the tracks.
     """
-    expected = (*tracks.visible.shape, 3)
-    if shapes.shape != expected or not np.isfinite(shapes).all():
-        got = f"{shapes.shape}" if shapes.shape != expected else "values that are not finite"
-        raise InvalidInput(
-            "wrong_shape", field="start", expected=f"finite shapes {expected}", got=got, hint="Pass a solution of these tracks."
-        )  # fmt: skip
+    hint = "Pass a solution of these tracks."
+    shapes = numeric(start, "start", hint).astype(np.float64)
+    expected, reach = (
+        (*observations.tracks.visible.shape, 3),
+        MAX_COORDINATE * observations.normalized.unit / observations.world_scale,
+    )
+    if shapes.shape != expected:
+        raise wrong_input("start", "wrong_shape", f"finite shapes {expected}", shape_text(shapes), hint)
+    if not (np.abs(shapes) <= reach).all():  # also rejects NaN
+        got = "larger ones" if np.isfinite(shapes).all() else "values that are not finite"
+        raise wrong_input("start", "out_of_range", f"finite coordinates within ±{reach:.3g}", got, hint)
+    return shapes
 
 
 def without_learned_prior(settings: Settings) -> Settings:

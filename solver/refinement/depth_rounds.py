@@ -64,7 +64,10 @@ def correct_perspective(evidence: Evidence, how: Refinement) -> Evidence:
 
 
 def _correct_from(evidence: Evidence, found: Learned, view: Perspective, how: Refinement) -> tuple[Evidence, Learned]:
-    """Return the evidence with the tracks corrected after alternation from `found` and κ, with κ positive where z points away."""
+    """Return the evidence with the tracks corrected after alternation from `found` and κ, with κ positive where z points away.
+
+    If the depths diverge, the energy is at least `UNLIKELY`, and the tracks are not corrected.
+    """
     if view.inverse_focal * view.signs[0] < 0:
         view = replace(view, inverse_focal=-view.inverse_focal, flipped=-1)
         turned, covariance = mirrored(found.rotations, found.covariance)
@@ -73,6 +76,8 @@ def _correct_from(evidence: Evidence, found: Learned, view: Perspective, how: Re
         estimate = replace(estimate, rotations=MIRROR @ estimate.rotations @ MIRROR)
         evidence = replace(evidence, estimate=estimate)
     found, view = alternate(view, found, evidence.used, how)
+    if found.energy >= UNLIKELY:
+        return evidence, found
     return _with_corrected_tracks(evidence, found, view), found
 
 

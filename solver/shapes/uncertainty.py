@@ -212,7 +212,8 @@ def _variance(prior: Floats, crossed: Floats, image: Floats, weights: Floats, no
     if len(seen) == 0:
         return prior
     inner = image[np.ix_(seen, seen)]
-    inner[np.diag_indices(len(seen))] += noise / np.repeat(weights, 2)[seen]
+    rounding = np.finfo(float).eps * float(np.trace(inner))  # less noise would leave the matrix singular
+    inner[np.diag_indices(len(seen))] += np.maximum(noise / np.repeat(weights, 2)[seen], rounding)
     factor = linalg.cholesky(inner, lower=True, overwrite_a=True, check_finite=False)
     explained = linalg.solve_triangular(factor, crossed[:, seen].T, lower=True, check_finite=False)
     return np.asarray(prior - np.einsum("rc,rc->c", explained, explained).reshape(-1, 3).sum(axis=1))

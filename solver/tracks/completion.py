@@ -22,7 +22,7 @@ from pliant.solver.threads import SMALLEST, over_ranges
 from pliant.solver.tracks.frame_selection import longest_gaps
 from pliant.solver.tracks.matrix import centred, columns
 from pliant.solver.tracks.noise import RAYLEIGH_MEDIAN, weighted_median
-from pliant.solver.tracks.normalization import Normalized
+from pliant.solver.tracks.normalization import MAX_MEDIAN_RADII, Normalized
 
 MAX_SAMPLE_POINTS = 600
 """Maximum number of points to which the basis is fitted."""
@@ -86,10 +86,14 @@ class Filling:
     def filled(self, points: Floats, weight: Floats) -> tuple[Floats, float]:
         """Replace hidden entries and outliers by predictions; also return the replaced share of the visible entries' confidence.
 
+        In a frame that shows about as few points as the basis has columns, noise determines M, and hidden points were predicted hundreds of
+        radii away. No prediction goes beyond the distance up to which an observation counts.
+
         An entry with confidence 0 < c < 1 becomes c times itself plus 1 − c times its prediction: the EM completion of an
         observation whose noise variance is 1/c times as large.
         """
         predicted, wrong = self._predicted(points, weight)
+        predicted *= (MAX_MEDIAN_RADII / np.maximum(_lengths(predicted), MAX_MEDIAN_RADII))[..., None]
         trust = np.where(wrong, 0.0, weight)[..., None]
         filled = np.where(trust == 1, points, predicted + trust * (points - predicted))
         return filled, float(weight[wrong].sum() / max(weight.sum(), np.finfo(float).tiny))

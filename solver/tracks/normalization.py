@@ -64,7 +64,7 @@ def normalize(tracks: Tracks) -> Normalized:
     if not unit > 1e-12 * max(float(np.abs(centroid).max()), np.finfo(float).tiny):
         raise InvalidInput(
             "no_extent", field="tracks", expected="points that differ from each other in a frame",
-            got="one position for all visible points of each frame",
+            got="one position for all visible points of each frame, to within rounding",
             hint="Check that the points' axis is the second one, that the tracks are not all zero, and that frames show several points.",
         )  # fmt: skip
     points /= unit

@@ -137,6 +137,15 @@ def test_a_perturbed_start_converges_to_the_same_energy_and_shapes(
     assert metrics.e3d_frame(away.shapes, here.shapes) < 0.02
 
 
+@pytest.mark.parametrize("size", [1e3, 1e10])
+def test_an_absurd_start_gives_the_shapes_of_no_start(cameras: Cameras, size: float) -> None:
+    """Starting at 1e10 times the size, the solve without a learned prior stopped as converged at .9e10."""
+    absurd = size * MADE.scales.mean() * np.random.default_rng(0).normal(size=MADE.shapes.shape)
+    here = solve_shapes(MADE.tracks, cameras, None, MADE.mesh)
+    away = solve_shapes(MADE.tracks, cameras, None, MADE.mesh, start=absurd)
+    np.testing.assert_array_equal(away.shapes, here.shapes)
+
+
 def test_cameras_and_prior_of_some_points_give_the_shapes_of_all(solution: Solution) -> None:
     some = Tracks.from_arrays(MADE.tracks.points[:, ::2])
     cameras = estimate_cameras(some, KNOWN)
@@ -228,6 +237,8 @@ def test_mismatched_inputs_are_rejected(cameras: Cameras, prior: Prior, solution
         ("prior", lambda: solve_shapes(tracks, in_perspective, learn_prior(fewer, short))),
         ("start", lambda: solve_shapes(tracks, cameras, prior, start=solution.shapes[:, :5])),
         ("start", lambda: solve_shapes(tracks, cameras, prior, start=solution.shapes * np.nan)),
+        ("start", lambda: solve_shapes(tracks, cameras, prior, start=solution.shapes * 1e200)),
+        ("start", lambda: solve_shapes(tracks, cameras, prior, start="shapes")),  # type: ignore[arg-type]
         ("rotations", lambda: estimate_cameras(fewer, KNOWN)),
     ):
         with pytest.raises(InvalidInput) as caught:

@@ -177,6 +177,8 @@ class TestKnownCamera:
             (np.tile(np.eye(3), (4, 1, 1)), np.ones(3), "scales", "wrong_shape"),
             (np.tile(np.eye(3), (4, 1, 1)), np.zeros(4), "scales", "out_of_range"),
             (np.tile(np.eye(3), (4, 1, 1)), np.full(4, np.inf), "scales", "out_of_range"),
+            (np.tile(np.eye(3), (4, 1, 1)), np.full(4, 1e-300), "scales", "out_of_range"),
+            (np.tile(np.eye(3), (4, 1, 1)), np.full(4, 1e300), "scales", "out_of_range"),
             (np.tile(np.eye(3), (4, 1, 1)), np.array([1, 1, 1, 1.1e4]), "scales", "out_of_range"),
             (np.zeros((0, 3, 3)), None, "rotations", "wrong_shape"),
             ([[1, 0, 0], [0, 1]], None, "rotations", "wrong_type"),

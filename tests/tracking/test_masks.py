@@ -100,3 +100,11 @@ def test_an_unknown_format_is_named_without_the_folder(tmp_path: Path) -> None:
     with pytest.raises(FilmError) as caught:
         read_region(tmp_path / "mask.png", SIZE)
     assert caught.value.got == "mask.png: its format is not recognised"
+
+
+@pytest.mark.parametrize("away", [100, -100])
+def test_a_polygon_outside_the_picture_is_refused_with_where_it_lies(away: int) -> None:
+    with pytest.raises(FilmError) as caught:
+        read_region([(away, away), (away + 9, away), (away + 9, away + 5)], SIZE)
+    assert caught.value.code == "empty_region"
+    assert caught.value.got == f"x from {away} to {away + 9} and y from {away} to {away + 5}, outside the picture"

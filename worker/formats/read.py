@@ -295,5 +295,8 @@ def _hidden_notes(tracks: Tracks) -> list[str]:
     notes = [f"{hidden:.1%} of the observations are hidden and carry no weight."] if hidden else []
     unseen = np.flatnonzero((tracks.visible > 0).sum(axis=1) == 0)
     if len(unseen):
-        notes.append(f"{len(unseen)} frames have no visible points (first: frame {unseen[0]}).")
+        some = f"1 frame has no visible points: frame {unseen[0]}."
+        notes.append(
+            some if len(unseen) == 1 else f"{len(unseen)} frames have no visible points (first: frame {unseen[0]})."
+        )
     return notes

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pliant.solver import Settings
 from pliant.solver.cameras import factorization
-from pliant.solver.cameras.factorization import leading_eigenpairs, upgrade
+from pliant.solver.cameras.factorization import leading_eigenpairs, upgrade, upgrades
 from pliant.solver.cameras.planar_ambiguity import is_planar
 from pliant.solver.cameras.scale import rigid_evidence
 from pliant.solver.gallery import face
@@ -56,3 +56,7 @@ def test_the_factorization_of_long_films_reports_progress(gram: Floats, monkeypa
     with pulses_to(lambda: pulses.append(None)):
         leading_eigenpairs(gram, 9)
     assert len(pulses) == factorization.ITERATIONS
+
+
+def test_too_few_points_for_any_factorization_give_none(gram: Floats) -> None:
+    assert list(upgrades(gram, [])) == []

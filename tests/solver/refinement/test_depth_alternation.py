@@ -103,6 +103,9 @@ def test_a_round_that_places_points_behind_a_camera_is_discarded(
         estimate=SimpleNamespace(perspective=view), start_scales=np.ones(12), used=np.arange(12)
     )
     assert depth_rounds.update_correction(evidence, flat, Refinement()) == (evidence, flat)
+    same, found = depth_rounds._correct_from(evidence, flat, view, Refinement())  # its depth map may be singular
+    assert same is evidence
+    assert found.energy == UNLIKELY
 
 
 def rolled_and_turned(frames: int, points: int) -> Tracks:

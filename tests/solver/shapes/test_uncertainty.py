@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pliant.solver.gallery import face
@@ -216,3 +218,12 @@ def test_std_of_sparse_points_is_bounded_by_their_distance_from_the_surface() ->
     assert np.array_equal(bounded[:, [0, 2]], std[:, [0, 2]])
     assert bounded_by_neighbours(std, shapes, np.ones((4, 3))) is std
     assert bounded_by_neighbours(std, shapes, np.zeros((4, 3))) is std
+
+
+def test_noise_below_the_rounding_of_a_huge_covariance_gives_finite_deviations() -> None:
+    """As with wrong given rotations, where the shapes are many radii deep."""
+    given = covariance()
+    huge = replace(given, mean_covariance=1e12 * given.mean_covariance)
+    found = position_std(huge, projections(degrees=1e-3), np.ones((FRAMES, 2)), noise_std=1e-4)
+    assert np.isfinite(found).all()
+    assert (found > 0).all()

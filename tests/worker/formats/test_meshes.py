@@ -208,7 +208,7 @@ def test_the_generated_mesh_uses_the_frame_with_most_visible_points() -> None:
     assert mesh is not None
     assert "frame 2" in notes[0]
     assert 3 not in mesh.faces
-    assert "1 points belong to no face" in notes[1]
+    assert "1 point belongs to no face" in notes[1]
 
 
 def test_points_on_a_line_get_no_mesh(tmp_path: Path) -> None:

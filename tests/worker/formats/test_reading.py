@@ -112,7 +112,7 @@ def test_sparsely_observed_points_keep_their_index_and_are_reported(tmp_path: Pa
     tracks[:, 4] = np.nan
     got = read(tmp_path, tracks=tracks)
     assert got.tracks.num_points == P
-    assert any("points 4" in note for note in got.interpretation.notes)
+    assert any("(point 4)" in note for note in got.interpretation.notes)
 
 
 def test_inputs_survive_storage_bit_for_bit(tmp_path: Path) -> None:

@@ -267,3 +267,14 @@ def test_a_mask_selects_pixels_of_a_picture(tmp_path: Path) -> None:
     assert got.selection is not None
     np.testing.assert_array_equal(got.selection.points, GRID[2:9:2, 4:11:2].ravel())
     np.testing.assert_array_equal(got.tracks.points, POINTS[:, got.selection.points])
+
+
+def test_one_frame_and_one_point_are_counted_in_the_singular(tmp_path: Path) -> None:
+    tracks = np.random.default_rng(0).uniform(0, 100, (6, 20, 2))
+    tracks[4] = np.nan
+    tracks[1:, 7] = np.nan
+    np.savez(tmp_path / "tracks.npz", tracks=tracks)
+    notes = read_inputs(tracks=tmp_path / "tracks.npz", mesh="none", options=Options(min_seen=2)).interpretation.notes
+    assert "1 frame has no visible points: frame 4." in notes
+    (left_out,) = (note for note in notes if "excluded" in note)
+    assert left_out.startswith("1 point is visible in fewer than 2 frames and excluded from the solve (point 7).")

@@ -42,7 +42,8 @@ def triangulate(tracks: Tracks, *, y_axis: str) -> tuple[Mesh | None, list[str]]
         f"{int((~kept).sum())} of {len(kept)} triangles with an edge over {MAX_EDGE_RATIO:g} × the median were removed."
     ]
     if alone:
-        notes.append(f"{alone} points belong to no face of the generated mesh and have no smoothness in space.")
+        belong = "1 point belongs" if alone == 1 else f"{alone} points belong"
+        notes.append(f"{belong} to no face of the generated mesh: no smoothness in space there.")
     return mesh, notes
 
 

@@ -141,7 +141,8 @@ def _thin_mesh(
         f"{len(mesh.faces)} faces became {len(coarse.faces)}."
     ]
     if alone:
-        notes.append(f"{alone} of the points used belong to no face and have no smoothness in space.")
+        belong = "1 of the points used belongs" if alone == 1 else f"{alone} of the points used belong"
+        notes.append(f"{belong} to no face: no smoothness in space there.")
     return kept, coarse, notes
 
 

@@ -76,9 +76,11 @@ def hide_sparsely_observed(
         )  # fmt: skip
     confidence[:, dropped] = 0.0
     shown = ", ".join(str(index) for index in dropped[:LISTED_POINTS]) + (" …" if len(dropped) > LISTED_POINTS else "")
+    those = "1 point is" if len(dropped) == 1 else f"{len(dropped)} points are"
+    which = f"point{'' if len(dropped) == 1 else 's'} {shown}"
     notes = [
-        f"{len(dropped)} points are visible in fewer than {options.min_seen} frames and excluded from the solve (points {shown}). They "
-        "keep their index in the result."
+        f"{those} visible in fewer than {options.min_seen} frames and excluded from the solve ({which}). "
+        "The result keeps all indices."
     ]
     near = np.zeros(0, dtype=np.intp) if mesh is None else np.intersect1d(dropped, mesh.faces)
     if len(near):
