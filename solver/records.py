@@ -376,9 +376,8 @@ def _positive_scales(scales: ArrayLike, frames: int) -> Floats:
     factors = np.array(numeric(scales, "scales", hint), dtype=np.float64)
     if factors.shape != (frames,):
         raise wrong_input("scales", "wrong_shape", f"{frames} numbers", shape_text(factors), hint)
-    within = (factors >= 1 / MAX_COORDINATE) & (
-        factors <= MAX_COORDINATE
-    )  # False for NaN; beyond, files in single precision overflow
+    # False for NaN. Files in single precision would overflow beyond.
+    within = (factors >= 1 / MAX_COORDINATE) & (factors <= MAX_COORDINATE)
     if not within.all():
         expected = f"positive numbers from {1 / MAX_COORDINATE:g} to {MAX_COORDINATE:g}"
         raise wrong_input("scales", "out_of_range", expected, f"{factors[~within][0]:.3g}", hint)

@@ -43,7 +43,7 @@ def triangulate(tracks: Tracks, *, y_axis: str) -> tuple[Mesh | None, list[str]]
     ]
     if alone:
         belong = "1 point belongs" if alone == 1 else f"{alone} points belong"
-        notes.append(f"{belong} to no face of the generated mesh: no smoothness in space there.")
+        notes.append(f"{belong} to no face of the generated mesh; smoothness in space has no effect there.")
     return mesh, notes
 
 

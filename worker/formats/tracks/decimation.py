@@ -142,7 +142,7 @@ def _thin_mesh(
     ]
     if alone:
         belong = "1 of the points used belongs" if alone == 1 else f"{alone} of the points used belong"
-        notes.append(f"{belong} to no face: no smoothness in space there.")
+        notes.append(f"{belong} to no face; smoothness in space has no effect there.")
     return kept, coarse, notes
 
 
