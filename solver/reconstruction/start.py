@@ -271,14 +271,12 @@ def start_shapes(start: ArrayLike, observations: Observations) -> Floats:
     """
     hint = "Pass a solution of these tracks."
     shapes = numeric(start, "start", hint).astype(np.float64)
-    expected, reach = (
-        (*observations.tracks.visible.shape, 3),
-        MAX_COORDINATE * observations.normalized.unit / observations.world_scale,
-    )
+    expected = (*observations.tracks.visible.shape, 3)
+    reach = MAX_COORDINATE * observations.normalized.unit / observations.world_scale
     if shapes.shape != expected:
-        raise wrong_input("start", "wrong_shape", f"finite shapes {expected}", shape_text(shapes), hint)
+        raise wrong_input("start", "wrong_shape", f"shapes {expected}", shape_text(shapes), hint)
     if not (np.abs(shapes) <= reach).all():  # also rejects NaN
-        got = "larger ones" if np.isfinite(shapes).all() else "values that are not finite"
+        got = f"one of {np.abs(shapes).max():.3g}" if np.isfinite(shapes).all() else "values that are not finite"
         raise wrong_input("start", "out_of_range", f"finite coordinates within ±{reach:.3g}", got, hint)
     return shapes
 

@@ -86,8 +86,8 @@ class Filling:
     def filled(self, points: Floats, weight: Floats) -> tuple[Floats, float]:
         """Replace hidden entries and outliers by predictions; also return the replaced share of the visible entries' confidence.
 
-        In a frame that shows about as few points as the basis has columns, noise determines M, and hidden points were predicted hundreds of
-        radii away. No prediction goes beyond the distance up to which an observation counts.
+        In a frame that shows about as few points as the basis has columns, noise determines M and would place hidden points hundreds of
+        radii away. Predictions are therefore moved towards the centroid, to a distance of at most `MAX_MEDIAN_RADII` normalized units.
 
         An entry with confidence 0 < c < 1 becomes c times itself plus 1 − c times its prediction: the EM completion of an
         observation whose noise variance is 1/c times as large.

@@ -80,7 +80,7 @@ def hide_sparsely_observed(
     which = f"point{'' if len(dropped) == 1 else 's'} {shown}"
     notes = [
         f"{those} visible in fewer than {options.min_seen} frames and excluded from the solve ({which}). "
-        "The result keeps all indices."
+        "Points keep their indices in the result."
     ]
     near = np.zeros(0, dtype=np.intp) if mesh is None else np.intersect1d(dropped, mesh.faces)
     if len(near):
